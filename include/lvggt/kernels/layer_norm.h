@@ -1,0 +1,15 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "lvggt/core/context.h"
+#include "lvggt/core/tensor.h"
+
+namespace lvggt {
+
+// y = gamma * (x - mean) / sqrt(var + eps) + beta over the last axis; var is the population variance, by
+// two passes. gamma and beta may be empty (no affine part).
+//   y, x: [N, C]   gamma, beta: [C]   y may be x.
+void layer_norm_forward(View<float, 2> y, View<const float, 2> x, View<const float, 1> gamma,
+                        View<const float, 1> beta, float eps, Context& ctx);
+
+}  // namespace lvggt

@@ -1,0 +1,118 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "lvggt/core/parallel.h"
+
+#include <sched.h>
+#include <tbb/global_control.h>
+#include <tbb/parallel_for.h>
+#include <tbb/task_arena.h>
+
+#include <cmath>
+#include <fstream>
+#include <optional>
+#include <string>
+
+namespace lvggt {
+
+namespace {
+
+int affinity_threads() {
+  cpu_set_t set;
+  CPU_ZERO(&set);
+  if (sched_getaffinity(0, sizeof(set), &set) != 0) return 1;
+  return std::max(1, CPU_COUNT(&set));
+}
+
+// The path of this process's group in the hierarchy that /proc/self/cgroup lists under `controller`
+// ("" is the unified hierarchy).
+std::string cgroup_path(const std::string& controller) {
+  std::ifstream file("/proc/self/cgroup");
+  for (std::string line; std::getline(file, line);) {
+    const auto first = line.find(':');
+    const auto second = line.find(':', first + 1);
+    if (first == std::string::npos || second == std::string::npos) continue;
+    const std::string names = "," + line.substr(first + 1, second - first - 1) + ",";
+    if (names == "," + controller + "," || (!controller.empty() && names.find("," + controller + ",") != std::string::npos))
+      return line.substr(second + 1);
+  }
+  return "/";
+}
+
+// CPUs that one group's files allow, 0 when they set no limit.
+double quota_of(const std::string& directory) {
+  double quota = 0, period = 0;
+  if (std::ifstream file(directory + "/cpu.max"); file >> quota >> period && period > 0)
+    return quota / period;
+  std::ifstream quota_file(directory + "/cpu.cfs_quota_us"), period_file(directory + "/cpu.cfs_period_us");
+  if (quota_file >> quota && period_file >> period && quota > 0 && period > 0) return quota / period;
+  return 0;
+}
+
+// The tightest CPU quota between this process's group and the root, 0 for none.
+double cgroup_quota() {
+  double tightest = 0;
+  const auto visit = [&](const std::string& root, std::string path) {
+    while (true) {
+      const double quota = quota_of(root + path);
+      if (quota > 0 && (tightest == 0 || quota < tightest)) tightest = quota;
+      const auto slash = path.rfind('/');
+      if (slash == std::string::npos || path.empty()) break;
+      path.resize(slash);
+    }
+  };
+  visit("/sys/fs/cgroup", cgroup_path(""));
+  visit("/sys/fs/cgroup/cpu", cgroup_path("cpu"));
+  return tightest;
+}
+
+}  // namespace
+
+int available_threads(std::string* reason) {
+  int threads = affinity_threads();
+  std::string why = "the CPUs this process may run on";
+  const double quota = cgroup_quota();
+  if (quota > 0 && std::floor(quota) < threads) {
+    threads = std::max(1, static_cast<int>(std::floor(quota)));
+    why = "the control group's CPU quota";
+  }
+  if (reason) *reason = why;
+  return threads;
+}
+
+struct Context::Threads {
+  explicit Threads(int n) : arena(n) {
+    // oneTBB starts no more workers than there are CPUs unless it is told to.
+    if (n > tbb::this_task_arena::max_concurrency())
+      more_than_cpus.emplace(tbb::global_control::max_allowed_parallelism, static_cast<std::size_t>(n));
+  }
+  std::optional<tbb::global_control> more_than_cpus;
+  tbb::task_arena arena;
+};
+
+Context::Context(int num_threads) {
+  if (num_threads < 0 || num_threads > kMaxThreads)
+    fail(ErrorKind::kUsage, "threads: ", num_threads, " is not between 0 (all available) and ", kMaxThreads);
+  num_threads_ = num_threads == 0 ? available_threads() : num_threads;
+  threads_ = std::make_unique<Threads>(num_threads_);
+}
+
+Context::~Context() = default;
+
+void parallel_chunks(std::int64_t num_chunks, FunctionRef<void(std::int64_t, int)> body,
+                     Context& ctx) {
+  if (num_chunks <= 0) return;
+  if (num_chunks == 1 || ctx.num_threads() == 1) {
+    for (std::int64_t chunk = 0; chunk < num_chunks; ++chunk) body(chunk, 0);
+    return;
+  }
+  ctx.threads().arena.execute([&] {
+    tbb::parallel_for(
+        tbb::blocked_range<std::int64_t>(0, num_chunks, 1),
+        [&](const tbb::blocked_range<std::int64_t>& range) {
+          const int worker = tbb::this_task_arena::current_thread_index();
+          for (std::int64_t chunk = range.begin(); chunk != range.end(); ++chunk) body(chunk, worker);
+        },
+        tbb::simple_partitioner());
+  });
+}
+
+}  // namespace lvggt
