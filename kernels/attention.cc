@@ -1,0 +1,256 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "lvggt/kernels/attention.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <numbers>
+
+#include "lvggt/core/parallel.h"
+
+#undef HWY_TARGET_INCLUDE
+#define HWY_TARGET_INCLUDE "kernels/attention.cc"
+#include "hwy/foreach_target.h"
+//
+#include "hwy/highway.h"
+#include "kernels/simd-inl.h"
+#include "kernels/tile-inl.h"
+
+#ifndef LVGGT_ATTENTION_ONCE
+#define LVGGT_ATTENTION_ONCE
+namespace lvggt::kernels {
+
+// Queries of one head handled together: keys and values of a block are read from the second-level cache
+// once for each register tile of rows, so only the outputs (96 x 64 floats) and queries are larger than that.
+inline constexpr std::int64_t kQueryBlock = 96;  // a multiple of every tile's rows
+// Keys scored before the running maximum is updated: at most 15 panels = 240 keys. The keys and values of a
+// block (2 x 240 x 64 floats = 120 KiB) stay in the second-level cache for all tiles of a query block, the
+// scores of a tile (8 x 240 floats) in the first-level cache.
+inline constexpr std::int64_t kKeyPanels = 15;
+inline constexpr std::int64_t kScorePitch = kKeyPanels * kPanelWidth;
+
+struct AttentionScratch {
+  float* queries = nullptr;     // [kQueryBlock, D], scaled
+  float* outputs = nullptr;     // [kQueryBlock, D rounded up to a panel]
+  float* scores = nullptr;      // [8, kScorePitch]
+  const float** rows = nullptr;  // [kQueryBlock] queries, then [8] scores
+  float* maximum = nullptr;     // [kQueryBlock]
+  float* sum = nullptr;         // [kQueryBlock]
+};
+inline constexpr std::int64_t kMaxTileRows = 8;
+
+}  // namespace lvggt::kernels
+#endif
+
+HWY_BEFORE_NAMESPACE();
+namespace lvggt::kernels::HWY_NAMESPACE {
+namespace {
+
+// 2^x for x <= 0: x = n + f with |f| <= 1/2, 2^f by its Taylor polynomial of degree 6 (remainder
+// (ln 2 / 2)^7 / 7! = 1.2e-7), n added to the exponent. Below -126 the result is 2^-126, which is nothing
+// beside the row's maximum, which counts 1. NaN stays NaN.
+HWY_INLINE hn::Vec<Floats> exp2_nonpositive(Floats d, hn::Vec<Floats> x) {
+  const hn::RebindToSigned<Floats> di;
+  x = hn::IfThenElse(hn::Lt(x, hn::Set(d, -126.0f)), hn::Set(d, -126.0f), x);
+  const auto n = hn::Round(x);
+  const auto f = hn::Sub(x, n);
+  auto p = hn::Set(d, 1.5403530e-4f);
+  p = hn::MulAdd(p, f, hn::Set(d, 1.3333558e-3f));
+  p = hn::MulAdd(p, f, hn::Set(d, 9.6181291e-3f));
+  p = hn::MulAdd(p, f, hn::Set(d, 5.5504109e-2f));
+  p = hn::MulAdd(p, f, hn::Set(d, 2.4022651e-1f));
+  p = hn::MulAdd(p, f, hn::Set(d, 6.9314718e-1f));
+  p = hn::MulAdd(p, f, hn::Set(d, 1.0f));
+  const auto exponent = hn::ShiftLeft<23>(hn::ConvertTo(di, n));
+  return hn::IfThenElse(hn::Eq(x, x), hn::BitCast(d, hn::Add(hn::BitCast(di, p), exponent)), x);
+}
+
+// Turns one row of scores into weights 2^(score - maximum), and brings the row's running maximum, sum and
+// output to the new maximum. `keys` is a multiple of 16.
+HWY_INLINE void softmax_row(float* HWY_RESTRICT scores, std::int64_t keys, float& maximum, float& sum,
+                            float* HWY_RESTRICT output, std::int64_t width) {
+  const Floats d;
+  auto largest0 = hn::LoadU(d, scores);
+  auto largest1 = largest0;
+  for (std::int64_t i = 0; i < keys; i += kPanelWidth) {
+    for (int v = 0; v < kPanelVectors; v += 2) {
+      largest0 = hn::Max(largest0, hn::LoadU(d, scores + i + v * kLanes));
+      if (v + 1 < kPanelVectors) largest1 = hn::Max(largest1, hn::LoadU(d, scores + i + (v + 1) * kLanes));
+    }
+  }
+  const float largest = hn::GetLane(hn::MaxOfLanes(d, hn::Max(largest0, largest1)));
+  if (largest > maximum) {
+    // exp2f(-infinity) is 0: nothing was summed yet.
+    const float shrink = std::exp2(maximum - largest);
+    maximum = largest;
+    sum *= shrink;
+    const auto factor = hn::Set(d, shrink);
+    for (std::int64_t i = 0; i < width; i += kLanes) {
+      hn::StoreU(hn::Mul(hn::LoadU(d, output + i), factor), d, output + i);
+    }
+  }
+  const auto shift = hn::Set(d, maximum);
+  hn::Vec<Floats> sums[kPanelVectors];
+  for (int v = 0; v < kPanelVectors; ++v) sums[v] = hn::Zero(d);
+  for (std::int64_t i = 0; i < keys; i += kPanelWidth) {
+#pragma GCC unroll 4
+    for (int v = 0; v < kPanelVectors; ++v) {
+      float* p = scores + i + v * kLanes;
+      const auto weight = exp2_nonpositive(d, hn::Sub(hn::LoadU(d, p), shift));
+      sums[v] = hn::Add(sums[v], weight);
+      hn::StoreU(weight, d, p);
+    }
+  }
+  for (int v = 1; v < kPanelVectors; ++v) sums[0] = hn::Add(sums[0], sums[v]);
+  sum += hn::GetLane(hn::SumOfLanes(d, sums[0]));
+}
+
+// Keys [panel0, panel1) of one head of one group against all queries of the block.
+void attend_block(const PackedKeysValues& group, std::int64_t head, std::int64_t panel0, std::int64_t panel1,
+                  std::int64_t num_queries, const AttentionScratch& s) {
+  const std::int64_t D = group.head_dim;
+  const std::int64_t panels = num_panels(group.num_tokens);
+  const std::int64_t feature_panels = num_panels(D);
+  const std::int64_t padded_tokens = panels * kPanelWidth;
+  const std::int64_t width = feature_panels * kPanelWidth;
+  const float* keys = group.keys + (head * panels + panel0) * D * kPanelWidth;
+  const float* values =
+      group.values + head * width * padded_tokens + panel0 * kPanelWidth * kPanelWidth;
+  const std::int64_t num_keys = (panel1 - panel0) * kPanelWidth;
+  const std::int64_t valid_keys = std::min(num_keys, group.num_tokens - panel0 * kPanelWidth);
+
+  for (std::int64_t r = 0; r < num_queries; r += kTileRows) {
+    for_panel_groups(panel1 - panel0, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
+      tile_of<false>(count, s.rows + r, 0, 1, D, keys + first * D * kPanelWidth, D * kPanelWidth,
+                     s.scores + first * kPanelWidth, kScorePitch);
+    });
+    for (std::int64_t i = 0; i < kTileRows; ++i) {
+      float* scores = s.scores + i * kScorePitch;
+      std::fill(scores + valid_keys, scores + num_keys, -std::numeric_limits<float>::infinity());
+      softmax_row(scores, num_keys, s.maximum[r + i], s.sum[r + i], s.outputs + (r + i) * width, width);
+    }
+    for_panel_groups(feature_panels, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
+      tile_of<true>(count, s.rows + kQueryBlock, 0, 1, num_keys, values + first * padded_tokens * kPanelWidth,
+                    padded_tokens * kPanelWidth, s.outputs + r * width + first * kPanelWidth, width);
+    });
+  }
+}
+
+// Queries [q0, q1) of one head over all groups.
+void attend(View<float, 3> y, View<const float, 3> q, std::span<const PackedKeysValues> past, float scale,
+            std::int64_t head, std::int64_t q0, std::int64_t q1, const AttentionScratch& s) {
+  const Floats d;
+  const std::int64_t D = q.extent(2);
+  const std::int64_t width = num_panels(D) * kPanelWidth;
+  const std::int64_t count = q1 - q0;
+  // Exponentials are taken to base 2, so the scale carries log2(e).
+  const auto factor = hn::Set(d, scale * std::numbers::log2e_v<float>);
+  for (std::int64_t r = 0; r < kQueryBlock; ++r) {
+    const float* from = q.data() + (q0 + std::min(r, count - 1)) * q.stride(0) + head * q.stride(1);
+    float* to = s.queries + r * D;
+    for (std::int64_t i = 0; i < D; i += kLanes) {
+      store_first(hn::Mul(load_first(d, from + i, D - i), factor), d, to + i, D - i);
+    }
+    s.rows[r] = to;
+  }
+  for (std::int64_t i = 0; i < kTileRows; ++i) s.rows[kQueryBlock + i] = s.scores + i * kScorePitch;
+  std::fill_n(s.outputs, kQueryBlock * width, 0.0f);
+  std::fill_n(s.maximum, kQueryBlock, -std::numeric_limits<float>::infinity());
+  std::fill_n(s.sum, kQueryBlock, 0.0f);
+
+  for (const PackedKeysValues& group : past) {
+    const std::int64_t panels = num_panels(group.num_tokens);
+    const std::int64_t blocks = (panels + kKeyPanels - 1) / kKeyPanels;
+    for (std::int64_t b = 0; b < blocks; ++b) {
+      attend_block(group, head, panels * b / blocks, panels * (b + 1) / blocks, count, s);
+    }
+  }
+
+  for (std::int64_t r = 0; r < count; ++r) {
+    const auto inverse = hn::Set(d, 1.0f / s.sum[r]);
+    float* to = y.data() + (q0 + r) * y.stride(0) + head * y.stride(1);
+    for (std::int64_t i = 0; i < D; i += kLanes) {
+      store_first(hn::Mul(hn::LoadU(d, s.outputs + r * width + i), inverse), d, to + i, D - i);
+    }
+  }
+}
+
+}  // namespace
+}  // namespace lvggt::kernels::HWY_NAMESPACE
+HWY_AFTER_NAMESPACE();
+
+#if HWY_ONCE
+namespace lvggt {
+
+namespace kernels {
+HWY_EXPORT(attend);
+}  // namespace kernels
+
+void pack_keys_values(PackedKeysValues packed, View<const float, 3> k, View<const float, 3> v,
+                      Context& ctx) {
+  const std::int64_t P = packed.num_tokens, D = packed.head_dim;
+  const Shape expected{P, packed.num_heads, D};
+  LVGGT_CHECK(k.shape() == expected && v.shape() == expected, "pack_keys_values: k is ", k.shape(), " and v is ",
+              v.shape(), " but the packed group is ", expected);
+  const std::int64_t panels = num_panels(P);
+  const std::int64_t padded = panels * kPanelWidth;
+  const std::int64_t feature_panels = num_panels(D);
+  parallel_chunks(
+      packed.num_heads,
+      [&](std::int64_t head, int) {
+        float* keys = packed.keys + head * padded * D;
+        float* values = packed.values + head * feature_panels * kPanelWidth * padded;
+        for (std::int64_t t = 0; t < padded; ++t) {
+          const bool valid = t < P;
+          const float* from_k = valid ? k.data() + t * k.stride(0) + head * k.stride(1) : nullptr;
+          const float* from_v = valid ? v.data() + t * v.stride(0) + head * v.stride(1) : nullptr;
+          float* to_k = keys + t / kPanelWidth * D * kPanelWidth + t % kPanelWidth;
+          for (std::int64_t i = 0; i < D; ++i) to_k[i * kPanelWidth] = valid ? from_k[i] : 0.0f;
+          for (std::int64_t f = 0; f < feature_panels; ++f) {
+            float* to_v = values + (f * padded + t) * kPanelWidth;
+            const std::int64_t n = valid ? std::min(kPanelWidth, D - f * kPanelWidth) : 0;
+            std::copy_n(from_v + (valid ? f * kPanelWidth : 0), n, to_v);
+            std::fill(to_v + n, to_v + kPanelWidth, 0.0f);
+          }
+        }
+      },
+      ctx);
+}
+
+void scaled_dot_product_attention(View<float, 3> y, View<const float, 3> q,
+                                  std::span<const PackedKeysValues> past, float scale, Context& ctx) {
+  using namespace kernels;
+  const auto [Nq, heads, D] = q.shape();
+  LVGGT_CHECK(y.shape() == q.shape(), "attention: y is ", y.shape(), " but q is ", q.shape());
+  std::int64_t num_keys = 0;
+  for (const PackedKeysValues& group : past) {
+    LVGGT_CHECK(group.num_heads == heads && group.head_dim == D, "attention: q is ", q.shape(),
+                " but the keys have ", group.num_heads, " heads of ", group.head_dim);
+    num_keys += group.num_tokens;
+  }
+  LVGGT_CHECK(num_keys > 0, "attention: there are no keys for q ", q.shape());
+
+  Arena::Scope scope(ctx.arena());
+  const std::int64_t workers = ctx.num_threads();
+  const std::int64_t width = num_panels(D) * kPanelWidth;
+  const auto queries = ctx.arena().alloc(Shape{workers, kQueryBlock, D});
+  const auto outputs = ctx.arena().alloc(Shape{workers, kQueryBlock, width});
+  const auto scores = ctx.arena().alloc(Shape{workers, kMaxTileRows, kScorePitch});
+  const auto rows = ctx.arena().alloc<const float*>(Shape{workers, kQueryBlock + kMaxTileRows});
+  const auto running = ctx.arena().alloc(Shape{workers, std::int64_t{2}, kQueryBlock});
+  const auto run = HWY_DYNAMIC_DISPATCH(attend);
+  const std::int64_t blocks = (Nq + kQueryBlock - 1) / kQueryBlock;
+  const std::int64_t num_queries = Nq;
+  parallel_chunks(
+      heads * blocks,
+      [&](std::int64_t chunk, int worker) {
+        const std::int64_t head = chunk / blocks, q0 = chunk % blocks * kQueryBlock;
+        run(y, q, past, scale, head, q0, std::min(num_queries, q0 + kQueryBlock),
+            {queries[worker].data(), outputs[worker].data(), scores[worker].data(), rows[worker].data(),
+             running[worker][0].data(), running[worker][1].data()});
+      },
+      ctx);
+}
+
+}  // namespace lvggt
+#endif

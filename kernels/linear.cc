@@ -1,0 +1,49 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "lvggt/kernels/linear.h"
+
+#include "kernels/product.h"
+
+namespace lvggt {
+
+PackedMatrix pack_linear(View<const float, 2> weight) {
+  const auto [N, K] = weight.shape();
+  PackedMatrix packed{N, 1, K, Tensor<float, 3>(Shape{num_panels(N), K, kPanelWidth})};
+  for (std::int64_t n = 0; n < N; ++n) {
+    const float* row = weight.data() + n * weight.stride(0);
+    float* lines = packed.panels.data() + n / kPanelWidth * K * kPanelWidth + n % kPanelWidth;
+    for (std::int64_t k = 0; k < K; ++k) lines[k * kPanelWidth] = row[k];
+  }
+  return packed;
+}
+
+void linear_forward(View<float, 2> y, View<const float, 2> x, const PackedMatrix& w,
+                    const Epilogue<2>& epilogue, Context& ctx) {
+  const auto [M, K] = x.shape();
+  LVGGT_CHECK(w.taps == 1 && K == w.K, "linear: x is ", x.shape(), " but the weight is ",
+              Shape{w.N, w.K});
+  LVGGT_CHECK(y.shape() == (Shape{M, w.N}), "linear: y is ", y.shape(), " but x ", x.shape(),
+              " and the weight ", Shape{w.N, w.K}, " give ", Shape{M, w.N});
+  LVGGT_CHECK(epilogue.bias.empty() || epilogue.bias.extent(0) == w.N, "linear: bias is ",
+              epilogue.bias.shape(), " but the weight is ", Shape{w.N, w.K});
+  LVGGT_CHECK(epilogue.gamma.empty() || epilogue.gamma.extent(0) == w.N, "linear: gamma is ",
+              epilogue.gamma.shape(), " but the weight is ", Shape{w.N, w.K});
+  LVGGT_CHECK(epilogue.residual.empty() || epilogue.residual.shape() == y.shape(),
+              "linear: residual is ", epilogue.residual.shape(), " but y is ", y.shape());
+
+  const View<const float, 2> residual = epilogue.residual;
+  const kernels::Product product{M, &w, 1, K, epilogue.bias.data(), epilogue.activation,
+                                 epilogue.gamma.data(), !residual.empty()};
+  kernels::run_product(
+      product,
+      [&](const kernels::RowTable& table) {
+        for (std::int64_t r = 0; r < table.count; ++r) {
+          const std::int64_t m = table.begin + r;
+          table.x[r] = x.data() + m * x.stride(0);
+          table.y[r] = y.data() + m * y.stride(0);
+          if (residual) table.residual[r] = residual.data() + m * residual.stride(0);
+        }
+      },
+      ctx);
+}
+
+}  // namespace lvggt

@@ -1,0 +1,41 @@
+// SPDX-License-Identifier: Apache-2.0
+// Private: the product behind linear, convolution and transposed convolution.
+#pragma once
+
+#include <cstdint>
+
+#include "lvggt/core/context.h"
+#include "lvggt/core/parallel.h"
+#include "lvggt/kernels/epilogue.h"
+#include "lvggt/kernels/packed_matrix.h"
+
+namespace lvggt::kernels {
+
+// Rows [begin, begin + count) of a product, as addresses: a linear layer has one input row for each
+// output row, a convolution one for every tap (a pixel, or a row of zeros beyond the border).
+struct RowTable {
+  std::int64_t begin = 0;
+  std::int64_t count = 0;
+  std::int64_t capacity = 0;   // distance between the inputs of two taps
+  const float** x = nullptr;   // [taps, capacity]
+  float** y = nullptr;         // [capacity]
+  const float** residual = nullptr;  // [capacity]; unused without a residual
+};
+
+// y[m] = residual[m] + gamma * activation(sum over taps t of x[t][m] w_t^T + bias)
+struct Product {
+  std::int64_t M = 0;
+  const PackedMatrix* w = nullptr;
+  std::int64_t taps = 0;  // taps * K lines a panel: the weight's own, or neighbouring taps read as one
+  std::int64_t K = 0;
+  const float* bias = nullptr;
+  Activation activation = Activation::kNone;
+  const float* gamma = nullptr;
+  bool has_residual = false;
+};
+
+// Runs the product; gather(table) fills in the addresses of the rows it is asked for. It is called from
+// worker threads and may run more than once for the same rows.
+void run_product(const Product& product, FunctionRef<void(const RowTable&)> gather, Context& ctx);
+
+}  // namespace lvggt::kernels
