@@ -18,17 +18,18 @@ inline constexpr std::int64_t kMaxVideoFrames = 10'000'000;
 
 // Which frames of the input to deliver: start, start + stride, ... at most max_frames of them.
 struct FrameSourceOptions {
-  std::int64_t start = 0;                                            // >= 0
-  std::int64_t stride = 1;                                           // >= 1
+  std::int64_t start = 0;                                              // >= 0
+  std::int64_t stride = 1;                                             // >= 1
   std::int64_t max_frames = std::numeric_limits<std::int64_t>::max();  // >= 1
   double images_per_second = 30;  // > 0; gives the frames of a folder, which have no times, theirs
   ImageLimits limits;             // of every frame
 };
 
 struct InputFrame {
-  std::int64_t source_index = 0;  // position in the folder or video, counted from 0 before the selection
-  double timestamp = 0;           // seconds, greater than that of the frame before
-  std::string name;               // file name of an image, "frame 12" of a video
+  std::int64_t source_index =
+      0;                 // position in the folder or video, counted from 0 before the selection
+  double timestamp = 0;  // seconds, greater than that of the frame before
+  std::string name;      // file name of an image, "frame 12" of a video
   Image image;
 };
 
@@ -46,8 +47,8 @@ class FrameSource {
  public:
   virtual ~FrameSource() = default;
 
-  // The next selected frame; nothing after the last. Throws Error as load_image() and open_video() do, and
-  // kMismatch when a frame's size differs from the first one's.
+  // The next selected frame; nothing after the last. Throws Error as load_image() and open_video()
+  // do, and kMismatch when a frame's size differs from the first one's.
   virtual std::optional<InputFrame> next() = 0;
 
   // How many frames the whole selection has, -1 if unknown. For a video it is what the file claims.
@@ -63,13 +64,15 @@ class FrameSource {
   std::vector<std::string> warnings_;
 };
 
-// Orders names as people do: runs of digits by value, so that "frame2.png" comes before "frame10.png".
+// Orders names as people do: runs of digits by value, so that "frame2.png" comes before
+// "frame10.png".
 bool natural_less(std::string_view a, std::string_view b);
 
-// The PNG and JPEG files (by extension, in any case) of a folder in natural order, or one image file.
-// Hidden files, folders and other files are skipped and counted. Errors: kUsage (options out of range,
-// start beyond the last frame), kRead, kUnsupported (no image in the folder).
-std::unique_ptr<FrameSource> open_images(const std::string& path, const FrameSourceOptions& options = {});
+// The PNG and JPEG files (by extension, in any case) of a folder in natural order, or one image
+// file. Hidden files, folders and other files are skipped and counted. Errors: kUsage (options out
+// of range, start beyond the last frame), kRead, kUnsupported (no image in the folder).
+std::unique_ptr<FrameSource> open_images(const std::string& path,
+                                         const FrameSourceOptions& options = {});
 
 // How a video file is opened: open_video of lvggt/io/video.h, which needs the library lvggt::video.
 using VideoOpener = std::unique_ptr<FrameSource> (*)(const std::string& path,
@@ -77,8 +80,10 @@ using VideoOpener = std::unique_ptr<FrameSource> (*)(const std::string& path,
 
 // A folder of images, an image or a video:
 //   auto frames = open_frames(path, options, open_video);
-// Without a VideoOpener a video is a kUnsupported error. The path is never anything but a file name.
-std::unique_ptr<FrameSource> open_frames(const std::string& path, const FrameSourceOptions& options = {},
+// Without a VideoOpener a video is a kUnsupported error. The path is never anything but a file
+// name.
+std::unique_ptr<FrameSource> open_frames(const std::string& path,
+                                         const FrameSourceOptions& options = {},
                                          VideoOpener video = nullptr);
 
 }  // namespace lvggt

@@ -14,16 +14,16 @@ namespace lvggt {
 // No picture with more pixels than this is decoded, whatever the options say.
 inline constexpr std::int64_t kMaxImagePixels = std::int64_t{1} << 28;
 
-// Above this many pixels a file must have at least one byte for every kMaxPixelsPerByte of them. The
-// emptiest JPEG has about 170 pixels a byte; only a picture made to exhaust memory has more.
+// Above this many pixels a file must have at least one byte for every kMaxPixelsPerByte of them.
+// The emptiest JPEG has about 170 pixels a byte; only a picture made to exhaust memory has more.
 inline constexpr std::int64_t kUncheckedPixels = std::int64_t{1} << 24;
 inline constexpr std::int64_t kMaxPixelsPerByte = 256;
 
 // Largest picture file that is read into memory.
 inline constexpr std::int64_t kMaxImageBytes = std::int64_t{1} << 30;
 
-// A progressive JPEG with more scans than this is refused: each one costs a pass over all pixels, while
-// encoders write about ten.
+// A progressive JPEG with more scans than this is refused: each one costs a pass over all pixels,
+// while encoders write about ten.
 inline constexpr int kMaxJpegScans = 100;
 
 struct ImageLimits {
@@ -48,14 +48,15 @@ struct FileGuess {
 // 64 bytes are enough; fewer are fine.
 FileGuess guess_file(std::span<const std::byte> head);
 
-// Reads a PNG or JPEG; the content decides which, not the name. 16-bit samples keep their upper byte, grey
-// and palettes become RGB, transparency is composited on white with Pillow's rounding, CMYK and YCCK are
-// converted when Adobe's marker defines them, and the EXIF orientation is applied. Colour profiles are
-// ignored with a note.
+// Reads a PNG or JPEG; the content decides which, not the name. 16-bit samples keep their upper
+// byte, grey and palettes become RGB, transparency is composited on white with Pillow's rounding,
+// CMYK and YCCK are converted when Adobe's marker defines them, and the EXIF orientation is
+// applied. Colour profiles are ignored with a note.
 //
-// Errors: kRead (missing, not a regular file), kFormat (not an image, empty, truncated, wrong checksum),
-// kUnsupported (another image format by name, animation, 12-bit, arithmetic coding), kLimit (too many
-// pixels for the limits or for the size of the file, too many scans). Sizes are checked before decoding.
+// Errors: kRead (missing, not a regular file), kFormat (not an image, empty, truncated, wrong
+// checksum), kUnsupported (another image format by name, animation, 12-bit, arithmetic coding),
+// kLimit (too many pixels for the limits or for the size of the file, too many scans). Sizes are
+// checked before decoding.
 Image load_image(const std::string& path, const ImageLimits& limits = {});
 
 // The same from memory; `name` stands for the file in messages.

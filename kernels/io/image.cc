@@ -1,0 +1,123 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "lvggt/io/image.h"
+
+#include <cstdlib>
+#include <memory>
+#include <string_view>
+
+#include "kernels/io/file_bytes.h"
+#include "kernels/io/image_check.h"
+#include "kernels/io/orientation.h"
+
+// Static, so that a program with its own copy of stb_image still links.
+#define STB_IMAGE_STATIC
+#define STB_IMAGE_IMPLEMENTATION
+#define STBI_ONLY_PNG
+#define STBI_ONLY_JPEG
+#define STBI_NO_STDIO
+#define STBI_NO_LINEAR
+#define STBI_FAILURE_USERMSG
+#pragma GCC diagnostic push
+#pragma GCC diagnostic ignored "-Wunused-function"
+#include <stb_image.h>
+#pragma GCC diagnostic pop
+
+namespace lvggt {
+
+namespace {
+
+using DecodedPixels = std::unique_ptr<stbi_uc, void (*)(void*)>;
+
+void check_size(std::int64_t width, std::int64_t height, std::size_t num_bytes,
+                const std::string& name, const ImageLimits& limits) {
+  if (limits.max_pixels < 1 || limits.max_pixels > kMaxImagePixels)
+    fail(ErrorKind::kUsage, "image limits: max_pixels ", limits.max_pixels,
+         " is not between 1 and ", kMaxImagePixels);
+  // Both sides are below 2^31, so the product fits.
+  const std::int64_t num_pixels = width * height;
+  if (num_pixels > limits.max_pixels)
+    fail(ErrorKind::kLimit, name, ": ", width, "x", height, " pixels are more than the limit of ",
+         limits.max_pixels);
+  if (num_pixels > kUncheckedPixels &&
+      num_pixels / kMaxPixelsPerByte > static_cast<std::int64_t>(num_bytes))
+    fail(ErrorKind::kLimit, name, ": claims ", width, "x", height, " pixels in ", num_bytes,
+         " bytes, more than the limit of ", kMaxPixelsPerByte, " a byte");
+}
+
+DecodedPixels decode(std::span<const std::byte> bytes, const std::string& name, Shape<3>& shape) {
+  int width = 0, height = 0, num_channels = 0;
+  DecodedPixels pixels(
+      stbi_load_from_memory(reinterpret_cast<const stbi_uc*>(bytes.data()),
+                            static_cast<int>(bytes.size()), &width, &height, &num_channels, 0),
+      stbi_image_free);
+  if (!pixels) {
+    const std::string_view reason = stbi_failure_reason();
+    fail(reason == "Out of memory" ? ErrorKind::kMemory : ErrorKind::kFormat, name,
+         ": its pixels cannot be decoded: ", reason);
+  }
+  shape = Shape<3>{{height, width, num_channels}};
+  return pixels;
+}
+
+// A colour sample over white, in the fixed point of Pillow's alpha_composite: 7 fractional bits and
+// a division by 255 through shifts.
+std::uint8_t over_white(std::uint32_t sample, std::uint32_t alpha) {
+  constexpr std::uint32_t kBits = 7;
+  const std::uint32_t coverage = alpha << kBits;
+  const std::uint32_t sum =
+      sample * coverage + 255 * ((255u << kBits) - coverage) + (0x80u << kBits);
+  return static_cast<std::uint8_t>((((sum >> 8) + sum) >> 8) >> kBits);
+}
+
+}  // namespace
+
+Image image_from_pixels(View<const std::uint8_t, 3> pixels) {
+  const auto [H, W, C] = pixels.shape();
+  LVGGT_CHECK(H > 0 && W > 0 && C >= 1 && C <= 4, "image_from_pixels: pixels are ", pixels.shape(),
+              ", expected [H, W, 1 to 4] and not empty");
+  Image image{Tensor<std::uint8_t, 3>(Shape{H, W, std::int64_t{3}}), {}};
+  const bool is_grey = C < 3, has_alpha = C == 2 || C == 4;
+  std::uint8_t* out = image.pixels.data();
+  for (std::int64_t y = 0; y < H; ++y) {
+    for (std::int64_t x = 0; x < W; ++x, out += 3) {
+      const std::uint8_t* in = pixels.data() + y * pixels.stride(0) + x * pixels.stride(1);
+      for (int c = 0; c < 3; ++c) {
+        const std::uint8_t sample = in[is_grey ? 0 : c];
+        out[c] = has_alpha ? over_white(sample, in[C - 1]) : sample;
+      }
+    }
+  }
+  return image;
+}
+
+Image load_image(std::span<const std::byte> bytes, const std::string& name,
+                 const ImageLimits& limits) {
+  if (bytes.empty()) fail(ErrorKind::kFormat, name, ": is empty, expected a PNG or JPEG image");
+  if (bytes.size() > static_cast<std::size_t>(kMaxImageBytes))
+    fail(ErrorKind::kLimit, name, ": has ", bytes.size(), " bytes, more than the limit of ",
+         kMaxImageBytes);
+  const FileGuess guess = guess_file(bytes.first(std::min<std::size_t>(bytes.size(), 64)));
+  if (guess.kind == FileKind::kUnsupportedImage)
+    fail(ErrorKind::kUnsupported, name, ": ", guess.name,
+         " images are not supported, convert it to PNG or JPEG");
+  if (guess.kind != FileKind::kPng && guess.kind != FileKind::kJpeg)
+    fail(ErrorKind::kFormat, name, ": is not a PNG or JPEG image",
+         guess.name.empty() ? "" : ", it looks like " + guess.name);
+
+  detail::ImageHeader header = guess.kind == FileKind::kPng ? detail::check_png(bytes, name)
+                                                            : detail::check_jpeg(bytes, name);
+  check_size(header.width, header.height, bytes.size(), name, limits);
+  Shape<3> shape;
+  const DecodedPixels decoded = decode(bytes, name, shape);
+  Image image = image_from_pixels(View<const std::uint8_t, 3>(decoded.get(), shape));
+  if (header.orientation != 1)
+    image.pixels = detail::reoriented(image.pixels, detail::from_exif(header.orientation));
+  image.notes = std::move(header.notes);
+  return image;
+}
+
+Image load_image(const std::string& path, const ImageLimits& limits) {
+  return load_image(detail::read_whole_file(path, kMaxImageBytes), path, limits);
+}
+
+}  // namespace lvggt
