@@ -38,6 +38,37 @@ HWY_INLINE void for_each_vector(std::int64_t count, const Body& body) {
   for_each_remainder<HWY_MAX_BYTES / sizeof(float)>(0, count, body);
 }
 
+// Sum over [0, count) of term(d, i), which returns the terms i .. i + Lanes(d) - 1. Four accumulators hide
+// the latency of the additions and make each partial sum short.
+template <std::size_t kLanes, class Term>
+HWY_INLINE float sum_remainder(std::int64_t begin, std::int64_t end, const Term& term) {
+  const hn::CappedTag<float, kLanes> d;
+  const auto N = static_cast<std::int64_t>(hn::Lanes(d));
+  auto sum = hn::Zero(d);
+  for (; begin + N <= end; begin += N) sum = hn::Add(sum, term(d, begin));
+  float total = hn::GetLane(hn::SumOfLanes(d, sum));
+  if constexpr (kLanes > 1) {
+    if (begin < end) total += sum_remainder<kLanes / 2>(begin, end, term);
+  }
+  return total;
+}
+template <class Term>
+HWY_INLINE float sum_vectors(std::int64_t count, const Term& term) {
+  const hn::ScalableTag<float> d;
+  const auto N = static_cast<std::int64_t>(hn::Lanes(d));
+  auto sum0 = hn::Zero(d), sum1 = sum0, sum2 = sum0, sum3 = sum0;
+  std::int64_t i = 0;
+  for (; i + 4 * N <= count; i += 4 * N) {
+    sum0 = hn::Add(sum0, term(d, i));
+    sum1 = hn::Add(sum1, term(d, i + N));
+    sum2 = hn::Add(sum2, term(d, i + 2 * N));
+    sum3 = hn::Add(sum3, term(d, i + 3 * N));
+  }
+  const auto sum = hn::Add(hn::Add(sum0, sum1), hn::Add(sum2, sum3));
+  return hn::GetLane(hn::SumOfLanes(d, sum)) +
+         sum_remainder<HWY_MAX_BYTES / sizeof(float)>(i, count, term);
+}
+
 // x = n ln2 + r with |r| <= ln2 / 2. Adding 1.5 * 2^23 rounds to an integer and leaves n in the low bits of
 // the sum. ln2 is split so that n times the first part is exact for every |n| < 2^15, with or without FMA.
 template <class V>
