@@ -7,6 +7,7 @@ packages=(
   build-essential cmake ninja-build pkg-config
   libhwy-dev libtbb-dev libeigen3-dev nlohmann-json3-dev  # kernels, threads, cameras, configuration
   libpng-dev libstb-dev libexif-dev libzip-dev            # pictures, .pth archives
+  libssl-dev                                              # SHA-256
   libavformat-dev libavcodec-dev libavutil-dev libswscale-dev
   libcli11-dev doctest-dev libbenchmark-dev
 )
