@@ -1,6 +1,50 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+// lvggt: from a video to a coloured, language-featured 4D point cloud, frame by frame. This is the one
+// header to include; a whole program (examples/embed, with its CMakeLists.txt):
+//
+//   #include <lvggt/io/video.h>
+//   #include <lvggt/lvggt.h>
+//
+//   #include <cstdio>
+//
+//   int main(int argc, char** argv) try {
+//     if (argc != 3) lvggt::fail(lvggt::ErrorKind::kUsage, "give a video or folder and the weights");
+//     lvggt::Context ctx;  // all CPUs this process may use
+//     const auto model = lvggt::LangVggt::load({.weights = argv[2]}, ctx);
+//     const lvggt::PreprocessOptions size{.size = static_cast<int>(model.config().img_size)};
+//
+//     lvggt::Stream stream(model, ctx);
+//     const auto frames = lvggt::open_frames(argv[1], {}, lvggt::open_video);
+//     while (const auto input = frames->next()) {
+//       const lvggt::PreparedFrame prepared = lvggt::prepare_frame(input->image, size);
+//       const lvggt::Frame frame = stream.push(prepared.pixels);  // its views live until the next push
+//
+//       const auto [H, W] = frame.depth.shape();
+//       const auto& pose = frame.camera.cam_from_world;           // [R | t], OpenCV axes
+//       const auto meaning = frame.language[0][H / 2][W / 2];     // [lang_dim], of the smallest level
+//       std::printf("%6.2f s  t (%.3f %.3f %.3f)  depth %.3f  semantics (%.3f %.3f %.3f)\n",
+//                   input->timestamp, pose(0, 3), pose(1, 3), pose(2, 3), frame.depth(H / 2, W / 2),
+//                   meaning(0), meaning(1), meaning(2));
+//     }
+//   } catch (const lvggt::Error& error) {
+//     std::fprintf(stderr, "embed: %s\n", error.what());
+//     return lvggt::exit_code(error.kind());
+//   }
+//
+// Errors are exceptions of type lvggt::Error. The library prints nothing, reads no environment variable,
+// installs no signal handler and has no globals. Link lvggt::lvggt; reading video files also needs
+// lvggt/io/video.h and lvggt::video (FFmpeg). What is where:
+//
+//   core/      Shape, View, Tensor; Error; Context (threads, scratch memory)
+//   model/     LangVggt, Stream, Frame; ModelConfig; names and shapes of the weights
+//   io/        pictures, folders and preprocessing; safetensors; output files
+//   geometry/  Camera, unprojection, confidence filter
+//   kernels/   the operators the model is made of; not included here
+//
+// Shapes are written beside every declaration, channels last: [H, W, C] and [B, H, W, C].
+
 #include "lvggt/core/arena.h"
 #include "lvggt/core/context.h"
 #include "lvggt/core/error.h"
@@ -8,3 +52,15 @@
 #include "lvggt/core/parallel.h"
 #include "lvggt/core/shape.h"
 #include "lvggt/core/tensor.h"
+#include "lvggt/geometry/camera.h"
+#include "lvggt/geometry/confidence.h"
+#include "lvggt/geometry/unproject.h"
+#include "lvggt/io/atomic_file.h"
+#include "lvggt/io/frame_source.h"
+#include "lvggt/io/image.h"
+#include "lvggt/io/preprocess.h"
+#include "lvggt/io/safetensors.h"
+#include "lvggt/model/config.h"
+#include "lvggt/model/deterministic_weights.h"
+#include "lvggt/model/lang_vggt.h"
+#include "lvggt/model/tensor_list.h"
