@@ -24,7 +24,8 @@ TEST_CASE("decode_pose_encoding: the quaternion is scalar-last and need not have
   CHECK(camera.cam_from_world.col(3) == Eigen::Vector3f(1, 2, 3));
 }
 
-TEST_CASE("decode_pose_encoding: a field of view of 90 degrees has a focal length of half the side") {
+TEST_CASE(
+    "decode_pose_encoding: a field of view of 90 degrees has a focal length of half the side") {
   const float right_angle = std::numbers::pi_v<float> / 2;
   const Camera camera = decode({0, 0, 0, 0, 0, 0, 1, right_angle, right_angle}, 56, 84);
   CHECK(camera.fy == doctest::Approx(28));
@@ -36,11 +37,12 @@ TEST_CASE("decode_pose_encoding: a field of view of 90 degrees has a focal lengt
 TEST_CASE("D32: a quaternion of zero norm and a field of view of 0 or pi are refused by name") {
   const float nan = std::numeric_limits<float>::quiet_NaN();
   CHECK_THROWS_WITH_AS(decode({0, 0, 0, 0, 0, 0, 0, 1, 1}), doctest::Contains("quaternion"), Error);
-  CHECK_THROWS_WITH_AS(decode({0, 0, 0, 0, 0, 0, 1, 0, 1}), doctest::Contains("fields of view are 0"),
-                       Error);
+  CHECK_THROWS_WITH_AS(decode({0, 0, 0, 0, 0, 0, 1, 0, 1}),
+                       doctest::Contains("fields of view are 0"), Error);
   CHECK_THROWS_WITH_AS(decode({0, 0, 0, 0, 0, 0, 1, 1, 3.15f}), doctest::Contains("fields of view"),
                        Error);
-  CHECK_THROWS_WITH_AS(decode({0, 0, 0, 0, 0, 0, 1, 1e-40f, 1}), doctest::Contains("overflow"), Error);
+  CHECK_THROWS_WITH_AS(decode({0, 0, 0, 0, 0, 0, 1, 1e-40f, 1}), doctest::Contains("overflow"),
+                       Error);
   CHECK_THROWS_WITH_AS(decode({0, nan, 0, 0, 0, 0, 1, 1, 1}), doctest::Contains("value 1"), Error);
   try {
     decode({0, 0, 0, 0, 0, 0, 1, 0, 1});

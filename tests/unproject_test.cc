@@ -15,7 +15,8 @@ TEST_CASE("unproject: projecting the points gives back their pixels and depths")
   const std::int64_t H = 14, W = 28;
   const Camera camera = decode_pose_encoding({encoding.data(), Shape{std::int64_t{9}}}, H, W);
   Tensor<float, 2> depth(Shape{H, W});
-  for (std::int64_t i = 0; i < depth.size(); ++i) depth.data()[i] = 1 + 0.01f * static_cast<float>(i);
+  for (std::int64_t i = 0; i < depth.size(); ++i)
+    depth.data()[i] = 1 + 0.01f * static_cast<float>(i);
   Tensor<float, 3> points(Shape{H, W, std::int64_t{3}});
   unproject(points, depth, camera, ctx);
   double worst = 0;
@@ -33,7 +34,8 @@ TEST_CASE("unproject: shapes that do not fit are refused by name") {
   Context ctx(1);
   Tensor<float, 2> depth(Shape{4, 5});
   Tensor<float, 3> points(Shape{5, 4, 3});
-  CHECK_THROWS_WITH_AS(unproject(points, depth, Camera{}, ctx), doctest::Contains("[5,4,3]"), Error);
+  CHECK_THROWS_WITH_AS(unproject(points, depth, Camera{}, ctx), doctest::Contains("[5,4,3]"),
+                       Error);
 }
 
 TEST_CASE("percentile_in_place: linear between ranks, as numpy.percentile") {
@@ -55,7 +57,8 @@ TEST_CASE("confidence_filter: keeps what reaches the percentile and the least co
   Tensor<float, 2> confidence(Shape{10, 10});
   for (std::int64_t i = 0; i < 100; ++i) confidence.data()[i] = static_cast<float>(i) / 10 + 1;
   Tensor<std::uint8_t, 2> keep(Shape{10, 10});
-  CHECK(confidence_filter(keep, confidence, 3, ctx) == 97);  // rank 2.97: indices 0, 1, 2 fall below
+  CHECK(confidence_filter(keep, confidence, 3, ctx) ==
+        97);  // rank 2.97: indices 0, 1, 2 fall below
   CHECK(keep(0, 2) == 0);
   CHECK(keep(0, 3) == 1);
 

@@ -13,17 +13,18 @@
 
 namespace lvggt {
 
-// A pinhole camera with OpenCV axes (+X right, +Y down, +Z forward); the first frame's camera of a stream is
-// close to the world's origin. Scale is relative: the model's unit is not a metre.
+// A pinhole camera with OpenCV axes (+X right, +Y down, +Z forward); the first frame's camera of a
+// stream is close to the world's origin. Scale is relative: the model's unit is not a metre.
 //
-// fx, fy, cx, cy are in pixel index coordinates, where the centre of the first pixel is (0, 0): pixel (u, v)
-// with depth z is the camera point ((u - cx) z / fx, (v - cy) z / fy, z).
+// fx, fy, cx, cy are in pixel index coordinates, where the centre of the first pixel is (0, 0):
+// pixel (u, v) with depth z is the camera point ((u - cx) z / fx, (v - cy) z / fy, z).
 struct Camera {
   Eigen::Matrix<float, 3, 4> cam_from_world = Eigen::Matrix<float, 3, 4>::Identity();
   float fx = 1, fy = 1, cx = 0, cy = 0;
 };
 
-// Entries of a pose encoding: translation, scalar-last quaternion, vertical and horizontal field of view.
+// Entries of a pose encoding: translation, scalar-last quaternion, vertical and horizontal field of
+// view.
 inline constexpr std::int64_t kPoseEncodingSize = 9;
 
 // The rotation of a scalar-last quaternion (x, y, z, w) of any length but zero: with s = 2 / |q|^2,
@@ -42,8 +43,8 @@ inline Eigen::Matrix3d rotation_from_quaternion(const Eigen::Vector4d& q) {
   return R;
 }
 
-// The unit quaternion (x, y, z, w) of a rotation, with w >= 0. Of the four ways to divide, the one by the
-// largest component is taken; Eigen::Quaternion would do, but leaves the sign open.
+// The unit quaternion (x, y, z, w) of a rotation, with w >= 0. Of the four ways to divide, the one
+// by the largest component is taken; Eigen::Quaternion would do, but leaves the sign open.
 inline Eigen::Vector4d quaternion_from_rotation(const Eigen::Matrix3d& R) {
   const double xx = R(0, 0), yy = R(1, 1), zz = R(2, 2);
   // Four times the squared components w, x, y, z.
@@ -51,10 +52,18 @@ inline Eigen::Vector4d quaternion_from_rotation(const Eigen::Matrix3d& R) {
                                       1 - xx - yy + zz};
   Eigen::Vector4d q;
   switch (std::max_element(squares.begin(), squares.end()) - squares.begin()) {
-    case 0: q << R(2, 1) - R(1, 2), R(0, 2) - R(2, 0), R(1, 0) - R(0, 1), squares[0]; break;
-    case 1: q << squares[1], R(1, 0) + R(0, 1), R(0, 2) + R(2, 0), R(2, 1) - R(1, 2); break;
-    case 2: q << R(1, 0) + R(0, 1), squares[2], R(1, 2) + R(2, 1), R(0, 2) - R(2, 0); break;
-    default: q << R(0, 2) + R(2, 0), R(1, 2) + R(2, 1), squares[3], R(1, 0) - R(0, 1); break;
+    case 0:
+      q << R(2, 1) - R(1, 2), R(0, 2) - R(2, 0), R(1, 0) - R(0, 1), squares[0];
+      break;
+    case 1:
+      q << squares[1], R(1, 0) + R(0, 1), R(0, 2) + R(2, 0), R(2, 1) - R(1, 2);
+      break;
+    case 2:
+      q << R(1, 0) + R(0, 1), squares[2], R(1, 2) + R(2, 1), R(0, 2) - R(2, 0);
+      break;
+    default:
+      q << R(0, 2) + R(2, 0), R(1, 2) + R(2, 1), squares[3], R(1, 0) - R(0, 1);
+      break;
   }
   q.normalize();
   return q[3] < 0 ? Eigen::Vector4d(-q) : q;
@@ -62,8 +71,8 @@ inline Eigen::Vector4d quaternion_from_rotation(const Eigen::Matrix3d& R) {
 
 // The camera of a pose encoding [tx ty tz | qx qy qz qw | fov_h fov_w] for a frame of H x W pixels:
 //   fy = (H / 2) / tan(fov_h / 2), fx = (W / 2) / tan(fov_w / 2), principal point (W / 2, H / 2).
-// Errors: kNumeric when a value is not finite, the quaternion is zero, or a field of view is not between 0
-// and pi, for which there is no focal length.
+// Errors: kNumeric when a value is not finite, the quaternion is zero, or a field of view is not
+// between 0 and pi, for which there is no focal length.
 inline Camera decode_pose_encoding(View<const float, 1> encoding, std::int64_t H, std::int64_t W) {
   LVGGT_CHECK(encoding.extent(0) == kPoseEncodingSize, "camera: a pose encoding has ",
               kPoseEncodingSize, " values, not ", encoding.extent(0));
@@ -109,11 +118,10 @@ inline std::array<float, kPoseEncodingSize> encode_pose(const Camera& camera, st
           fov(W, camera.fx)};
 }
 
-// Where a world point appears, in pixel index coordinates, and its depth: (u, v, z). u and v mean something
-// only for z > 0.
+// Where a world point appears, in pixel index coordinates, and its depth: (u, v, z). u and v mean
+// something only for z > 0.
 inline Eigen::Vector3d project(const Camera& camera, const Eigen::Vector3d& point_in_world) {
-  const Eigen::Vector3d p =
-      camera.cam_from_world.cast<double>() * point_in_world.homogeneous();
+  const Eigen::Vector3d p = camera.cam_from_world.cast<double>() * point_in_world.homogeneous();
   return {camera.fx * p[0] / p[2] + camera.cx, camera.fy * p[1] / p[2] + camera.cy, p[2]};
 }
 

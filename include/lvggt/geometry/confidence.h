@@ -17,9 +17,9 @@ inline constexpr float kMinConfidence = 1e-5f;
 // Default percentile of the confidence filter; the release's constant.
 inline constexpr double kConfidencePercentile = 3;
 
-// The p-th percentile with linear interpolation between the two nearest ranks, as numpy.percentile: rank
-// p / 100 * (n - 1). Reorders `values`. Errors: p outside [0, 100] or not a number (kUsage), no values
-// (kMismatch), a NaN among them (kNumeric).
+// The p-th percentile with linear interpolation between the two nearest ranks, as numpy.percentile:
+// rank p / 100 * (n - 1). Reorders `values`. Errors: p outside [0, 100] or not a number (kUsage),
+// no values (kMismatch), a NaN among them (kNumeric).
 inline float percentile_in_place(std::span<float> values, double p) {
   if (!(p >= 0 && p <= 100)) fail(ErrorKind::kUsage, "percentile: ", p, " is not in [0, 100]");
   LVGGT_CHECK(!values.empty(), "percentile: there are no values");
@@ -45,10 +45,8 @@ inline std::int64_t confidence_filter(View<std::uint8_t, 2> keep, View<const flo
               " but confidence is ", confidence.shape());
   Arena::Scope scope(ctx.arena());
   const auto values = ctx.arena().alloc<float>(Shape{H * W});
-  for (std::int64_t y = 0; y < H; ++y)
-    std::copy_n(confidence[y].data(), W, values.data() + y * W);
-  const float threshold =
-      percentile_in_place({values.data(), static_cast<std::size_t>(H * W)}, p);
+  for (std::int64_t y = 0; y < H; ++y) std::copy_n(confidence[y].data(), W, values.data() + y * W);
+  const float threshold = percentile_in_place({values.data(), static_cast<std::size_t>(H * W)}, p);
 
   std::int64_t kept = 0;
   for (std::int64_t y = 0; y < H; ++y) {
