@@ -20,24 +20,24 @@
 #define LVGGT_ATTENTION_ONCE
 namespace lvggt::kernels {
 
-// Queries of one head handled together: keys and values of a block are read from the second-level cache
-// once for each register tile of rows, so only the outputs (96 x 64 floats) and queries are larger than that.
+// Queries of one head handled together, and keys scored before the running maximum is updated: at most 15 panels =
+// 240 keys. The keys and values of a block (2 x 240 x 64 floats = 120 KiB), its scores (96 x 240 floats =
+// 90 KiB), the queries and the outputs (24 KiB each) fit a second-level cache of 512 KiB. Each product walks
+// all 96 rows with one group of panels, which stays in the first-level cache: a panel is 4 KiB of keys or
+// 15 KiB of values. 9, 12 and 15 panels measured alike.
 inline constexpr std::int64_t kQueryBlock = 96;  // a multiple of every tile's rows
-// Keys scored before the running maximum is updated: at most 15 panels = 240 keys. The keys and values of a
-// block (2 x 240 x 64 floats = 120 KiB) stay in the second-level cache for all tiles of a query block, the
-// scores of a tile (8 x 240 floats) in the first-level cache.
 inline constexpr std::int64_t kKeyPanels = 15;
-inline constexpr std::int64_t kScorePitch = kKeyPanels * kPanelWidth;
+inline constexpr std::int64_t kScorePitch = kKeyPanels * kPanelWidth + 16;
 
 struct AttentionScratch {
   float* queries = nullptr;     // [kQueryBlock, D], scaled
   float* outputs = nullptr;     // [kQueryBlock, D rounded up to a panel]
-  float* scores = nullptr;      // [8, kScorePitch]
-  const float** rows = nullptr;  // [kQueryBlock] queries, then [8] scores
+  float* scores = nullptr;      // [kQueryBlock, kScorePitch]
+  const float** query_rows = nullptr;  // [kQueryBlock]
+  const float** score_rows = nullptr;  // [kQueryBlock]
   float* maximum = nullptr;     // [kQueryBlock]
   float* sum = nullptr;         // [kQueryBlock]
 };
-inline constexpr std::int64_t kMaxTileRows = 8;
 
 }  // namespace lvggt::kernels
 #endif
@@ -119,21 +119,23 @@ void attend_block(const PackedKeysValues& group, std::int64_t head, std::int64_t
   const std::int64_t num_keys = (panel1 - panel0) * kPanelWidth;
   const std::int64_t valid_keys = std::min(num_keys, group.num_tokens - panel0 * kPanelWidth);
 
-  for (std::int64_t r = 0; r < num_queries; r += kTileRows) {
-    for_panel_groups(panel1 - panel0, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
-      tile_of<false>(count, s.rows + r, 0, 1, D, keys + first * D * kPanelWidth, D * kPanelWidth,
-                     s.scores + first * kPanelWidth, kScorePitch);
-    });
-    for (std::int64_t i = 0; i < kTileRows; ++i) {
-      float* scores = s.scores + i * kScorePitch;
-      std::fill(scores + valid_keys, scores + num_keys, -std::numeric_limits<float>::infinity());
-      softmax_row(scores, num_keys, s.maximum[r + i], s.sum[r + i], s.outputs + (r + i) * width, width);
+  for_panel_groups(panel1 - panel0, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
+    for (std::int64_t r = 0; r < num_queries; r += kTileRows) {
+      tile_of<false>(count, s.query_rows + r, 0, 1, D, keys + first * D * kPanelWidth, D * kPanelWidth,
+                     s.scores + r * kScorePitch + first * kPanelWidth, kScorePitch);
     }
-    for_panel_groups(feature_panels, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
-      tile_of<true>(count, s.rows + kQueryBlock, 0, 1, num_keys, values + first * padded_tokens * kPanelWidth,
-                    padded_tokens * kPanelWidth, s.outputs + r * width + first * kPanelWidth, width);
-    });
+  });
+  for (std::int64_t r = 0; r < num_queries; ++r) {
+    float* scores = s.scores + r * kScorePitch;
+    std::fill(scores + valid_keys, scores + num_keys, -std::numeric_limits<float>::infinity());
+    softmax_row(scores, num_keys, s.maximum[r], s.sum[r], s.outputs + r * width, width);
   }
+  for_panel_groups(feature_panels, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
+    for (std::int64_t r = 0; r < num_queries; r += kTileRows) {
+      tile_of<true>(count, s.score_rows + r, 0, 1, num_keys, values + first * padded_tokens * kPanelWidth,
+                    padded_tokens * kPanelWidth, s.outputs + r * width + first * kPanelWidth, width);
+    }
+  });
 }
 
 // Queries [q0, q1) of one head over all groups.
@@ -151,9 +153,9 @@ void attend(View<float, 3> y, View<const float, 3> q, std::span<const PackedKeys
     for (std::int64_t i = 0; i < D; i += kLanes) {
       store_first(hn::Mul(load_first(d, from + i, D - i), factor), d, to + i, D - i);
     }
-    s.rows[r] = to;
+    s.query_rows[r] = to;
+    s.score_rows[r] = s.scores + r * kScorePitch;
   }
-  for (std::int64_t i = 0; i < kTileRows; ++i) s.rows[kQueryBlock + i] = s.scores + i * kScorePitch;
   std::fill_n(s.outputs, kQueryBlock * width, 0.0f);
   std::fill_n(s.maximum, kQueryBlock, -std::numeric_limits<float>::infinity());
   std::fill_n(s.sum, kQueryBlock, 0.0f);
@@ -235,8 +237,8 @@ void scaled_dot_product_attention(View<float, 3> y, View<const float, 3> q,
   const std::int64_t width = num_panels(D) * kPanelWidth;
   const auto queries = ctx.arena().alloc(Shape{workers, kQueryBlock, D});
   const auto outputs = ctx.arena().alloc(Shape{workers, kQueryBlock, width});
-  const auto scores = ctx.arena().alloc(Shape{workers, kMaxTileRows, kScorePitch});
-  const auto rows = ctx.arena().alloc<const float*>(Shape{workers, kQueryBlock + kMaxTileRows});
+  const auto scores = ctx.arena().alloc(Shape{workers, kQueryBlock, kScorePitch});
+  const auto rows = ctx.arena().alloc<const float*>(Shape{workers, std::int64_t{2}, kQueryBlock});
   const auto running = ctx.arena().alloc(Shape{workers, std::int64_t{2}, kQueryBlock});
   const auto run = HWY_DYNAMIC_DISPATCH(attend);
   const std::int64_t blocks = (Nq + kQueryBlock - 1) / kQueryBlock;
@@ -246,8 +248,8 @@ void scaled_dot_product_attention(View<float, 3> y, View<const float, 3> q,
       [&](std::int64_t chunk, int worker) {
         const std::int64_t head = chunk / blocks, q0 = chunk % blocks * kQueryBlock;
         run(y, q, past, scale, head, q0, std::min(num_queries, q0 + kQueryBlock),
-            {queries[worker].data(), outputs[worker].data(), scores[worker].data(), rows[worker].data(),
-             running[worker][0].data(), running[worker][1].data()});
+            {queries[worker].data(), outputs[worker].data(), scores[worker].data(), rows[worker][0].data(),
+             rows[worker][1].data(), running[worker][0].data(), running[worker][1].data()});
       },
       ctx);
 }
