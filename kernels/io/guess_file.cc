@@ -50,16 +50,7 @@ constexpr std::array kMagics{
     Magic{"<MPD"sv, 0, FileKind::kPlaylist, "a DASH playlist"},
     Magic{"<?xml"sv, 0, FileKind::kPlaylist, "an XML file or DASH playlist"},
     Magic{"v=0"sv, 0, FileKind::kPlaylist, "an SDP session description"},
-    Magic{"ftyp"sv, 4, FileKind::kOther, "an MP4 or QuickTime video"},
-    Magic{"\x1a\x45\xdf\xa3"sv, 0, FileKind::kOther, "a Matroska or WebM video"},
-    Magic{"AVI "sv, 8, FileKind::kOther, "an AVI video"},
-    Magic{"%PDF"sv, 0, FileKind::kOther, "a PDF document"},
-    Magic{"PK\3\4"sv, 0, FileKind::kOther, "a ZIP archive"},
-    Magic{"version https://git-lfs"sv, 0, FileKind::kOther,
-          "a Git LFS pointer, not the file itself"},
     Magic{"<svg"sv, 0, FileKind::kUnsupportedImage, "SVG"},
-    Magic{"<!DOCTYPE"sv, 0, FileKind::kOther, "a web page"},
-    Magic{"<html"sv, 0, FileKind::kOther, "a web page"},
 };
 
 // "P6\n" and its relatives, and "BM": too short to be trusted without the byte that follows.

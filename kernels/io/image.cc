@@ -5,9 +5,10 @@
 #include <memory>
 #include <string_view>
 
-#include "kernels/io/file_bytes.h"
 #include "kernels/io/image_check.h"
 #include "kernels/io/orientation.h"
+#include "lvggt/io/checked.h"
+#include "lvggt/io/input_file.h"
 
 // Static, so that a program with its own copy of stb_image still links.
 #define STB_IMAGE_STATIC
@@ -17,6 +18,10 @@
 #define STBI_NO_STDIO
 #define STBI_NO_LINEAR
 #define STBI_FAILURE_USERMSG
+#define STBI_ASSERT(condition) \
+  ((condition)                 \
+       ? static_cast<void>(0)  \
+       : ::lvggt::fail(::lvggt::ErrorKind::kFormat, "an image breaks the rule " #condition))
 #pragma GCC diagnostic push
 #pragma GCC diagnostic ignored "-Wunused-function"
 #include <stb_image.h>
@@ -29,17 +34,13 @@ namespace {
 using DecodedPixels = std::unique_ptr<stbi_uc, void (*)(void*)>;
 
 void check_size(std::int64_t width, std::int64_t height, std::size_t num_bytes,
-                const std::string& name, const ImageLimits& limits) {
-  if (limits.max_pixels < 1 || limits.max_pixels > kMaxImagePixels)
-    fail(ErrorKind::kUsage, "image limits: max_pixels ", limits.max_pixels,
-         " is not between 1 and ", kMaxImagePixels);
-  // Both sides are below 2^31, so the product fits.
-  const std::int64_t num_pixels = width * height;
-  if (num_pixels > limits.max_pixels)
+                const std::string& name, const Limits& limits) {
+  const auto num_pixels = checked_mul(width, height);
+  if (!num_pixels || *num_pixels > limits.image_pixels)
     fail(ErrorKind::kLimit, name, ": ", width, "x", height, " pixels are more than the limit of ",
-         limits.max_pixels);
-  if (num_pixels > kUncheckedPixels &&
-      num_pixels / kMaxPixelsPerByte > static_cast<std::int64_t>(num_bytes))
+         limits.image_pixels);
+  if (*num_pixels > kUncheckedPixels &&
+      *num_pixels / kMaxPixelsPerByte > static_cast<std::int64_t>(num_bytes))
     fail(ErrorKind::kLimit, name, ": claims ", width, "x", height, " pixels in ", num_bytes,
          " bytes, more than the limit of ", kMaxPixelsPerByte, " a byte");
 }
@@ -57,6 +58,20 @@ DecodedPixels decode(std::span<const std::byte> bytes, const std::string& name, 
   }
   shape = Shape<3>{{height, width, num_channels}};
   return pixels;
+}
+
+// The decoder leaves colours beyond the end of a PNG's palette undefined: the file with black ones
+// added. It does not look at the checksum.
+std::vector<std::byte> with_full_palette(std::span<const std::byte> bytes, std::size_t palette) {
+  constexpr std::size_t kFullPalette = 3 * 256;
+  const std::size_t length = detail::big_endian32(bytes, palette);
+  const std::size_t end = palette + 8 + length;
+  std::vector<std::byte> result(bytes.begin(), bytes.begin() + static_cast<std::ptrdiff_t>(end));
+  result[palette + 2] = std::byte{kFullPalette >> 8};
+  result[palette + 3] = std::byte{kFullPalette & 0xff};
+  result.resize(palette + 8 + kFullPalette);
+  result.insert(result.end(), bytes.begin() + static_cast<std::ptrdiff_t>(end), bytes.end());
+  return result;
 }
 
 // A colour sample over white, in the fixed point of Pillow's alpha_composite: 7 fractional bits and
@@ -90,8 +105,7 @@ Image image_from_pixels(View<const std::uint8_t, 3> pixels) {
   return image;
 }
 
-Image load_image(std::span<const std::byte> bytes, const std::string& name,
-                 const ImageLimits& limits) {
+Image load_image(std::span<const std::byte> bytes, const std::string& name, const Limits& limits) {
   if (bytes.empty()) fail(ErrorKind::kFormat, name, ": is empty, expected a PNG or JPEG image");
   if (bytes.size() > static_cast<std::size_t>(kMaxImageBytes))
     fail(ErrorKind::kLimit, name, ": has ", bytes.size(), " bytes, more than the limit of ",
@@ -100,13 +114,17 @@ Image load_image(std::span<const std::byte> bytes, const std::string& name,
   if (guess.kind == FileKind::kUnsupportedImage)
     fail(ErrorKind::kUnsupported, name, ": ", guess.name,
          " images are not supported, convert it to PNG or JPEG");
-  if (guess.kind != FileKind::kPng && guess.kind != FileKind::kJpeg)
-    fail(ErrorKind::kFormat, name, ": is not a PNG or JPEG image",
-         guess.name.empty() ? "" : ", it looks like " + guess.name);
+  if (guess.kind != FileKind::kPng && guess.kind != FileKind::kJpeg) {
+    const std::string hint = content_hint(
+        {reinterpret_cast<const char*>(bytes.data()), std::min<std::size_t>(bytes.size(), 1024)});
+    fail(ErrorKind::kFormat, name, ": is not a PNG or JPEG image", hint.empty() ? "" : "; ", hint);
+  }
 
   detail::ImageHeader header = guess.kind == FileKind::kPng ? detail::check_png(bytes, name)
                                                             : detail::check_jpeg(bytes, name);
   check_size(header.width, header.height, bytes.size(), name, limits);
+  std::vector<std::byte> completed;
+  if (header.short_palette != 0) bytes = completed = with_full_palette(bytes, header.short_palette);
   Shape<3> shape;
   const DecodedPixels decoded = decode(bytes, name, shape);
   Image image = image_from_pixels(View<const std::uint8_t, 3>(decoded.get(), shape));
@@ -116,8 +134,14 @@ Image load_image(std::span<const std::byte> bytes, const std::string& name,
   return image;
 }
 
-Image load_image(const std::string& path, const ImageLimits& limits) {
-  return load_image(detail::read_whole_file(path, kMaxImageBytes), path, limits);
+Image load_image(const std::string& path, const Limits& limits) {
+  const InputFile file(path);
+  if (file.size() > kMaxImageBytes)
+    fail(ErrorKind::kLimit, path, ": has ", file.size(), " bytes, more than the limit of ",
+         kMaxImageBytes);
+  std::vector<std::byte> bytes(static_cast<std::size_t>(file.size()));
+  file.read_at(0, bytes.data(), bytes.size());
+  return load_image(bytes, path, limits);
 }
 
 }  // namespace lvggt

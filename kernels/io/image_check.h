@@ -14,6 +14,8 @@ struct ImageHeader {
   std::int64_t width = 0, height = 0;
   int orientation = 1;             // EXIF, 1 to 8
   std::vector<std::string> notes;  // see Image::notes
+  std::size_t short_palette = 0;  // where a PNG's palette chunk starts if it has fewer colours than
+                                  // samples can name; else 0
 };
 
 // Walk a whole file, from the signature to the end marker, without decoding pixels. The decoder is

@@ -42,7 +42,9 @@ bool valid_depth(std::uint32_t depth, std::uint32_t color_type) {
   }
 }
 
-void read_ihdr(std::span<const std::byte> data, const std::string& name, ImageHeader& header) {
+// Returns how many colours a sample can name, 0 without a palette.
+std::size_t read_ihdr(std::span<const std::byte> data, const std::string& name,
+                      ImageHeader& header) {
   if (data.size() != 13)
     fail(ErrorKind::kFormat, name, ": its PNG header has ", data.size(), " bytes instead of 13");
   header.width = big_endian32(data, 0);
@@ -54,6 +56,7 @@ void read_ihdr(std::span<const std::byte> data, const std::string& name, ImageHe
   if (!valid_depth(byte_at(data, 8), byte_at(data, 9)))
     fail(ErrorKind::kFormat, name, ": its PNG header combines bit depth ", byte_at(data, 8),
          " with colour type ", byte_at(data, 9), ", which is not defined");
+  return byte_at(data, 9) == 3 ? std::size_t{1} << byte_at(data, 8) : 0;
 }
 
 void read_chunk(std::string_view type, std::span<const std::byte> data, const std::string& name,
@@ -78,6 +81,7 @@ void read_chunk(std::string_view type, std::span<const std::byte> data, const st
 ImageHeader check_png(std::span<const std::byte> bytes, const std::string& name) {
   ImageHeader header;
   bool has_pixels = false;
+  std::size_t num_colors = 0;
   std::size_t at = 8;  // after the signature
   while (true) {
     const std::size_t left = bytes.size() - at;
@@ -92,7 +96,8 @@ ImageHeader check_png(std::span<const std::byte> bytes, const std::string& name)
            " has a wrong checksum");
     if (at == 8 && type != "IHDR" && type != "CgBI")
       fail(ErrorKind::kFormat, name, ": the PNG does not start with its header chunk");
-    if (type == "IHDR") read_ihdr(data, name, header);
+    if (type == "IHDR") num_colors = read_ihdr(data, name, header);
+    if (type == "PLTE" && data.size() < 3 * num_colors) header.short_palette = at;
     if (type == "IDAT") has_pixels = true;
     if (type == "IEND") break;
     read_chunk(type, data, name, header);

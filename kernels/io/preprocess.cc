@@ -19,6 +19,9 @@ constexpr std::array<std::pair<std::string_view, FrameMode>, 4> kModes{{
     {"gt", FrameMode::kGt},
 }};
 
+// Keeps sizes in int and products of two sides in 63 bits.
+constexpr std::int64_t kMaxPictureSide = (std::int64_t{1} << 31) - 1;
+
 // The steps after the turn: resize, cut a window out, put it into the frame.
 struct FramePlan {
   std::int64_t resized_width, resized_height;
@@ -133,9 +136,9 @@ std::string_view frame_mode_name(FrameMode mode) {
 
 ImageTransform plan_frame(std::int64_t width, std::int64_t height,
                           const PreprocessOptions& options) {
-  LVGGT_CHECK(width > 0 && height > 0 && width <= kMaxImagePixels / height,
-              "plan_frame: a picture of ", width, "x", height,
-              " pixels is empty or beyond the limit of ", kMaxImagePixels, " pixels");
+  LVGGT_CHECK(width > 0 && height > 0 && std::max(width, height) <= kMaxPictureSide,
+              "plan_frame: the sides of a picture of ", width, "x", height,
+              " pixels are not between 1 and ", kMaxPictureSide);
   ImageTransform transform;
   transform.original_width = static_cast<int>(width);
   transform.original_height = static_cast<int>(height);

@@ -13,16 +13,13 @@
 
 namespace lvggt {
 
-// No source delivers more frames than this.
-inline constexpr std::int64_t kMaxVideoFrames = 10'000'000;
-
 // Which frames of the input to deliver: start, start + stride, ... at most max_frames of them.
 struct FrameSourceOptions {
   std::int64_t start = 0;                                              // >= 0
   std::int64_t stride = 1;                                             // >= 1
   std::int64_t max_frames = std::numeric_limits<std::int64_t>::max();  // >= 1
   double images_per_second = 30;  // > 0; gives the frames of a folder, which have no times, theirs
-  ImageLimits limits;             // of every frame
+  Limits limits;                  // of every frame
 };
 
 struct InputFrame {

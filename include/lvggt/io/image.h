@@ -8,11 +8,9 @@
 #include <vector>
 
 #include "lvggt/core/tensor.h"
+#include "lvggt/io/limits.h"
 
 namespace lvggt {
-
-// No picture with more pixels than this is decoded, whatever the options say.
-inline constexpr std::int64_t kMaxImagePixels = std::int64_t{1} << 28;
 
 // Above this many pixels a file must have at least one byte for every kMaxPixelsPerByte of them.
 // The emptiest JPEG has about 170 pixels a byte; only a picture made to exhaust memory has more.
@@ -26,10 +24,6 @@ inline constexpr std::int64_t kMaxImageBytes = std::int64_t{1} << 30;
 // while encoders write about ten.
 inline constexpr int kMaxJpegScans = 100;
 
-struct ImageLimits {
-  std::int64_t max_pixels = kMaxImagePixels;  // 1 to kMaxImagePixels
-};
-
 // An 8-bit RGB picture, upright and opaque.
 struct Image {
   Tensor<std::uint8_t, 3> pixels;  // [H, W, 3]
@@ -39,11 +33,11 @@ struct Image {
   std::int64_t height() const { return pixels.extent(0); }
 };
 
-// What the first bytes of a file say it is.
+// What the first bytes of a file say it is, as far as pictures and videos are concerned.
 enum class FileKind { kPng, kJpeg, kUnsupportedImage, kPlaylist, kOther };
 struct FileGuess {
   FileKind kind;
-  std::string name;  // "PNG", "HEIC", "an HLS playlist", ...; empty when unknown
+  std::string name;  // "PNG", "HEIC", "an HLS playlist", ...; empty for kOther
 };
 // 64 bytes are enough; fewer are fine.
 FileGuess guess_file(std::span<const std::byte> head);
@@ -57,11 +51,11 @@ FileGuess guess_file(std::span<const std::byte> head);
 // checksum), kUnsupported (another image format by name, animation, 12-bit, arithmetic coding),
 // kLimit (too many pixels for the limits or for the size of the file, too many scans). Sizes are
 // checked before decoding.
-Image load_image(const std::string& path, const ImageLimits& limits = {});
+Image load_image(const std::string& path, const Limits& limits = {});
 
 // The same from memory; `name` stands for the file in messages.
 Image load_image(std::span<const std::byte> bytes, const std::string& name,
-                 const ImageLimits& limits = {});
+                 const Limits& limits = {});
 
 // An Image of pixels already decoded: grey, grey + alpha, RGB or RGBA by the number of channels.
 Image image_from_pixels(View<const std::uint8_t, 3> pixels);  // [H, W, 1 to 4]
