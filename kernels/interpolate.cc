@@ -4,6 +4,7 @@
 #undef HWY_TARGET_INCLUDE
 #define HWY_TARGET_INCLUDE "kernels/interpolate.cc"
 #include <hwy/foreach_target.h>
+#include <hwy/cache_control.h>
 #include <hwy/highway.h>
 
 #include <algorithm>
@@ -39,12 +40,25 @@ HWY_INLINE void blend(float* HWY_RESTRICT y, const float* a, const float* b, flo
   });
 }
 
+// The same, written past the caches; y must be aligned and C a multiple of the vector.
+HWY_INLINE void blend_streaming(float* HWY_RESTRICT y, const float* a, const float* b, float weight,
+                                std::int64_t C) {
+  const hn::ScalableTag<float> d;
+  for (std::int64_t i = 0; i < C; i += static_cast<std::int64_t>(hn::Lanes(d))) {
+    const auto from_a = hn::Mul(hn::LoadU(d, a + i), hn::Set(d, 1.0f - weight));
+    hn::Stream(hn::MulAdd(hn::LoadU(d, b + i), hn::Set(d, weight), from_a), d, y + i);
+  }
+}
+
 // One output row from two input rows. The two input columns around an output pixel are blended vertically into
 // `columns` [2, C], which stays in L1, and are kept while the next output pixel needs them: when enlarging,
 // every input value is read from memory once and every output pixel costs one horizontal blend.
 void bilinear_row(float* HWY_RESTRICT y, std::int64_t y_step, std::int64_t Wo, std::int64_t C,
                   const float* upper, const float* lower, std::int64_t x_step, float weight,
-                  const LinearTap* taps, float* columns) {
+                  const LinearTap* taps, float* columns, bool past_caches) {
+  const std::int64_t lanes = static_cast<std::int64_t>(hn::Lanes(hn::ScalableTag<float>()));
+  const bool streaming = past_caches && C % lanes == 0 && y_step % lanes == 0 &&
+                         reinterpret_cast<std::uintptr_t>(y) % (sizeof(float) * static_cast<std::uintptr_t>(lanes)) == 0;
   float* left = columns;
   float* right = columns + C;
   std::int64_t left_idx = -1, right_idx = -1;
@@ -62,8 +76,13 @@ void bilinear_row(float* HWY_RESTRICT y, std::int64_t y_step, std::int64_t Wo, s
       blend(right, upper + tap.high * x_step, lower + tap.high * x_step, weight, C);
       right_idx = tap.high;
     }
-    blend(y + i * y_step, left, right, tap.weight, C);
+    if (streaming) {
+      blend_streaming(y + i * y_step, left, right, tap.weight, C);
+    } else {
+      blend(y + i * y_step, left, right, tap.weight, C);
+    }
   }
+  if (streaming) hwy::FlushStream();
 }
 
 // y[c] = sum over j of weights[j] x[j * tap_step + c]
@@ -88,6 +107,10 @@ namespace {
 
 HWY_EXPORT(bilinear_row);
 HWY_EXPORT(weighted_sum);
+// Outputs of at least 32 MiB would be evicted before they are read again: writing them past the caches saves
+// fetching each line first (168x296 to 294x518, 256 channels, 2 threads: 14 ms against 26).
+constexpr std::int64_t kStreamingElements = std::int64_t{1} << 23;
+
 auto bilinear_row_function() { return &HWY_DYNAMIC_DISPATCH(bilinear_row); }
 auto weighted_sum_function() { return &HWY_DYNAMIC_DISPATCH(weighted_sum); }
 
@@ -160,6 +183,7 @@ void bilinear_forward(View<float, 4> y, View<const float, 4> x, bool align_corne
   const auto taps = kernels::linear_taps(Wo, x.extent(2), align_corners, ctx.arena());
   const auto columns = ctx.arena().alloc<float>(Shape{std::int64_t{ctx.num_threads()}, 2 * C});
   const auto row = kernels::bilinear_row_function();
+  const bool past_caches = y.size() >= kernels::kStreamingElements;
   // Up to eight neighbouring output rows to a chunk share their input rows in L2; at least 16 chunks, if there
   // are as many rows, to balance the threads.
   const std::int64_t grain = std::clamp<std::int64_t>(B * Ho / 16, 1, 8);
@@ -170,7 +194,7 @@ void bilinear_forward(View<float, 4> y, View<const float, 4> x, bool align_corne
           const auto& tap = rows[n % Ho];
           const auto image = x[n / Ho];
           row(y[n / Ho][n % Ho].data(), y.stride(2), Wo, C, image[tap.low].data(), image[tap.high].data(),
-              x.stride(2), tap.weight, taps.data(), columns[worker].data());
+              x.stride(2), tap.weight, taps.data(), columns[worker].data(), past_caches);
         }
       },
       ctx);

@@ -52,7 +52,7 @@ struct ExpectedProduct {
 
 // Applies the epilogue in double. `sum` is the exact product and `sum_of_magnitudes` the product of the operands'
 // magnitudes: a sum of K products in any order is off by at most K u times that, the bias adds a rounding.
-// No activation is steeper than 1.13 (GELU, SiLU 1.1), each is itself good to 1.5e-7 max(1, |y|), and
+// No activation is steeper than 1.13 (GELU, SiLU 1.1), each is itself good to 1.8e-7 max(1, |y|), and
 // gamma and the residual round once more each. The last axis is the channels'.
 template <int R>
 ExpectedProduct<R> expected_product(Tensor<double, R> sum, const Tensor<double, R>& sum_of_magnitudes, std::int64_t K,
@@ -69,7 +69,7 @@ ExpectedProduct<R> expected_product(Tensor<double, R> sum, const Tensor<double, 
       limit += kUnit * (sum_of_magnitudes.data()[i] + 2 * std::abs(operands.bias[i % N]));
     }
     if (parts.activation != Activation::kNone) {
-      limit = 1.13 * limit + 1.5e-7 * std::max(1.0, std::abs(y));
+      limit = 1.13 * limit + 1.8e-7 * std::max(1.0, std::abs(y));
       y = reference::activation(y, parts.activation);
     }
     if (parts.gamma) {
