@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "lvggt/core/error.h"
+#include "lvggt/model/checkpoint.h"
 
 namespace lvggt {
 namespace {
@@ -294,7 +295,9 @@ ModelConfig load_config(const std::string& path) {
   return parse_config(text, path);
 }
 
-std::string to_json(const ModelConfig& config) {
+namespace {
+
+Json json_of(const ModelConfig& config) {
   Json object;
   for_each_field(config, [&](const char* key, const auto& field) {
     if constexpr (std::is_same_v<std::remove_cvref_t<decltype(field)>, DecoderHead>) {
@@ -303,8 +306,25 @@ std::string to_json(const ModelConfig& config) {
       object[key] = field;
     }
   });
+  return object;
+}
+
+}  // namespace
+
+std::string to_json(const ModelConfig& config) {
+  Json object = json_of(config);
   for (const auto& [key, value] : fixed_options()) object[key] = value;
   return object.dump(1);
+}
+
+std::string config_difference(const ModelConfig& found, const ModelConfig& expected) {
+  const Json other = json_of(expected);
+  std::string text;
+  for (const auto& item : json_of(found).items())
+    if (item.key() != "name" && item.value() != other.at(item.key()))
+      text += (text.empty() ? "" : "; ") + item.key() + " is " + item.value().dump() + ", not " +
+              other.at(item.key()).dump();
+  return text;
 }
 
 }  // namespace lvggt

@@ -1,0 +1,34 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstddef>
+#include <utility>
+
+namespace lvggt {
+
+// Address space reserved up front; the system commits a page when it is first written and gives
+// zeros when it is first read. For buffers whose full size is known but may never be needed.
+class ReservedMemory {
+ public:
+  ReservedMemory() = default;
+  explicit ReservedMemory(
+      std::size_t num_bytes);  // kMemory when there is no such range of addresses
+  ~ReservedMemory();
+  ReservedMemory(ReservedMemory&& other) noexcept
+      : data_(std::exchange(other.data_, nullptr)),
+        num_bytes_(std::exchange(other.num_bytes_, 0)) {}
+  ReservedMemory& operator=(ReservedMemory&& other) noexcept {
+    std::swap(data_, other.data_);
+    std::swap(num_bytes_, other.num_bytes_);
+    return *this;
+  }
+
+  std::byte* data() const { return data_; }
+  std::size_t num_bytes() const { return num_bytes_; }
+
+ private:
+  std::byte* data_ = nullptr;
+  std::size_t num_bytes_ = 0;
+};
+
+}  // namespace lvggt

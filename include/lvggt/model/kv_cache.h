@@ -1,0 +1,103 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstdint>
+#include <span>
+
+#include "lvggt/core/reserved_memory.h"
+#include "lvggt/kernels/attention.h"
+
+namespace lvggt {
+
+// Largest number of past frames a cache accepts.
+inline constexpr std::int64_t kMaxPastFrames = std::int64_t{1} << 24;
+
+// Keys and values of past frames, for every layer, packed for the attention kernel when they are
+// made. The frames are a ring over address space reserved up front: memory is committed as the
+// first max_past_frames + 1 frames arrive, and nothing is allocated after construction.
+//
+// The running frame is what append() is given until end_frame(): it sees the cached frames and its
+// own tokens, so at most max_past_frames + 1 frames. end_frame() keeps it and then evicts the
+// oldest frames while more than max_past_frames are cached. A frame that is never ended leaves no
+// trace: the next one overwrites it.
+class KvCache {
+ public:
+  KvCache(std::int64_t num_layers, std::int64_t num_heads, std::int64_t head_dim,
+          std::int64_t tokens_per_frame, std::int64_t max_past_frames)
+      : num_layers_(num_layers),
+        num_heads_(num_heads),
+        head_dim_(head_dim),
+        tokens_per_frame_(tokens_per_frame),
+        max_past_frames_(max_past_frames) {
+    if (max_past_frames < 1 || max_past_frames > kMaxPastFrames)
+      fail(ErrorKind::kUsage, "kv_cache: the number of past frames must lie in [1, ",
+           kMaxPastFrames, "], not ", max_past_frames);
+    const double total = static_cast<double>(capacity()) * static_cast<double>(num_layers) *
+                         static_cast<double>(group_floats()) * sizeof(float);
+    if (total > 1e14)  // beyond the 47 bits of address space that a process has
+      fail(ErrorKind::kMemory, "kv_cache: ", max_past_frames, " past frames would take ", total,
+           " bytes; a smaller window fits");
+    groups_ = ReservedMemory(static_cast<std::size_t>(capacity()) * sizeof(PackedKeysValues));
+    floats_ = ReservedMemory(static_cast<std::size_t>(capacity() * num_layers * group_floats()) *
+                             sizeof(float));
+  }
+
+  // Keys and values of the running frame's tokens in one layer; a second call replaces the first.
+  //   k, v: [n, heads, D], n at most tokens_per_frame
+  void append(std::int64_t layer, View<const float, 3> k, View<const float, 3> v, Context& ctx) {
+    LVGGT_CHECK(k.extent(0) <= tokens_per_frame_, "kv_cache: ", k.extent(0),
+                " tokens where a frame has at most ", tokens_per_frame_);
+    running_tokens_ = k.extent(0);
+    pack_keys_values(group(num_frames_, layer), k, v, ctx);
+  }
+
+  // All groups that the running frame sees in a layer, oldest first, its own last; valid until the
+  // next call.
+  std::span<const PackedKeysValues> attended(std::int64_t layer) {
+    auto* groups = reinterpret_cast<PackedKeysValues*>(groups_.data());
+    for (std::int64_t i = 0; i <= num_frames_; ++i) groups[i] = group(i, layer);
+    return {groups, static_cast<std::size_t>(num_frames_ + 1)};
+  }
+
+  void end_frame() {
+    ++num_frames_;
+    while (num_frames_ > max_past_frames_) evict_oldest();
+  }
+
+  void evict_oldest() {
+    oldest_ = (oldest_ + 1) % capacity();
+    --num_frames_;
+  }
+
+  std::int64_t num_frames() const { return num_frames_; }  // cached, without the running one
+
+  // Bytes of a full cache.
+  std::size_t max_bytes() const { return floats_.num_bytes(); }
+
+ private:
+  std::int64_t capacity() const { return max_past_frames_ + 1; }
+  std::int64_t group_floats() const {
+    return packed_keys_size(num_heads_, tokens_per_frame_, head_dim_) +
+           packed_values_size(num_heads_, tokens_per_frame_, head_dim_);
+  }
+
+  // Frame `idx` counted from the oldest; idx == num_frames() is the running one. The layers of a
+  // frame lie side by side, so that memory is committed frame by frame.
+  PackedKeysValues group(std::int64_t idx, std::int64_t layer) const {
+    const std::int64_t slot = (oldest_ + idx) % capacity();
+    float* keys =
+        reinterpret_cast<float*>(floats_.data()) + (slot * num_layers_ + layer) * group_floats();
+    const std::int64_t tokens = idx == num_frames_ ? running_tokens_ : tokens_per_frame_;
+    return {keys, keys + packed_keys_size(num_heads_, tokens_per_frame_, head_dim_), num_heads_,
+            tokens, head_dim_};
+  }
+
+  std::int64_t num_layers_, num_heads_, head_dim_, tokens_per_frame_, max_past_frames_;
+  std::int64_t oldest_ = 0;  // slot
+  std::int64_t num_frames_ = 0;
+  std::int64_t running_tokens_ = 0;
+  ReservedMemory groups_;  // PackedKeysValues [capacity]
+  ReservedMemory floats_;  // [capacity, layers, keys then values]
+};
+
+}  // namespace lvggt

@@ -1,0 +1,23 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstddef>
+
+#include "lvggt/model/config.h"
+#include "lvggt/model/stream_options.h"
+
+namespace lvggt {
+
+// Bytes that a stream over frames of H x W needs; `total` is the sum.
+struct MemoryPlan {
+  std::size_t weights = 0;  // packed model, with the decoder
+  std::size_t cache = 0;    // keys and values when max_past_frames + 1 frames have been seen
+  std::size_t arenas = 0;   // scratch, tables and outputs
+  std::size_t total = 0;
+};
+
+// What is needed without loading anything; within about a tenth of the measured memory.
+MemoryPlan plan_memory(const ModelConfig& config, std::int64_t H, std::int64_t W,
+                       const StreamOptions& options = {});
+
+}  // namespace lvggt

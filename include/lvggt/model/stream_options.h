@@ -1,0 +1,26 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstdint>
+
+namespace lvggt {
+
+enum class CameraCache {
+  kStream,  // the camera head's attention sees its own entries of earlier frames, one per iteration
+  kPerFrame,  // each frame alone, as the released 4DLangVGGT demo does
+};
+
+struct StreamOptions {
+  std::int64_t max_past_frames = 128;  // frames kept in the caches after each push; at least 1
+  CameraCache camera_cache = CameraCache::kStream;
+  bool points = false;              // run the point head
+  bool rgb = true;                  // run the RGB head, if the decoder has one
+  bool decoder = true;              // run the decoder, if there is one
+  std::int64_t decoder_height = 0;  // size of rgb and language; both 0: the frame's size
+  std::int64_t decoder_width = 0;
+};
+
+// Largest side of a frame and of the decoder's outputs.
+inline constexpr std::int64_t kMaxSide = 16384;
+
+}  // namespace lvggt

@@ -1,0 +1,273 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "lvggt/model/checkpoint.h"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <set>
+
+#include "lvggt/core/error.h"
+
+namespace lvggt {
+namespace {
+
+constexpr std::size_t kMostNamed = 12;  // names listed in a warning; errors list all
+
+// Share of denormal values from which a tensor is odd enough to be mentioned.
+constexpr double kDenormalShare = 0.01;
+
+std::string join(const std::vector<std::string>& names, std::size_t most) {
+  std::string text;
+  for (std::size_t i = 0; i < std::min(names.size(), most); ++i)
+    text += (i == 0 ? "" : ", ") + names[i];
+  if (names.size() > most) text += " and " + std::to_string(names.size() - most) + " more";
+  return text;
+}
+
+constexpr std::string_view kDecoderPrefixes[] = {"feature_extractor.", "lang_encoder.",
+                                                 "lang_decoder", "rgb_encoder.", "rgb_decoder."};
+
+bool decoder_name(std::string_view name) {
+  return std::any_of(std::begin(kDecoderPrefixes), std::end(kDecoderPrefixes),
+                     [&](std::string_view prefix) { return name.starts_with(prefix); });
+}
+
+bool any_name(const Safetensors& file, bool (*predicate)(std::string_view)) {
+  return std::any_of(file.entries().begin(), file.entries().end(),
+                     [&](const TensorEntry& entry) { return predicate(entry.name); });
+}
+
+bool geometry_name(std::string_view name) {
+  return name.starts_with("aggregator.") || name.starts_with("camera_head.");
+}
+bool point_head_name(std::string_view name) { return name.starts_with("point_head."); }
+
+// What a file that is neither a geometry model nor a decoder looks like.
+std::string resemblance(const Safetensors& file) {
+  if (file.entries().empty()) return "it holds no tensors";
+  if (file.find("cls_token") && file.find("pos_embed"))
+    return "it looks like a DINOv2 encoder alone";
+  if (file.find("encoder.0.weight") && file.find("decoder.0.weight"))
+    return "it looks like a 4DLangSplat autoencoder";
+  for (const TensorEntry& entry : file.entries()) {
+    const std::size_t at = entry.name.find("aggregator.");
+    if (at != std::string::npos && at > 0)
+      return "its names begin with \"" + entry.name.substr(0, at) +
+             "\", which the weight converter removes";
+  }
+  return "its first tensor is " + file.entries().front().name;
+}
+
+bool looks_transposed(const std::vector<std::int64_t>& found,
+                      const std::vector<std::int64_t>& expected) {
+  if (found.size() != expected.size() || found.size() < 2) return false;
+  std::vector<std::int64_t> swapped = found;
+  std::swap(swapped[0], swapped[1]);
+  return swapped == expected || std::vector<std::int64_t>(found.rbegin(), found.rend()) == expected;
+}
+
+bool is_floating(Dtype dtype) {
+  return dtype == Dtype::kF32 || dtype == Dtype::kF16 || dtype == Dtype::kBF16 ||
+         dtype == Dtype::kF64;
+}
+
+}  // namespace
+
+struct Checkpoint::Problems {
+  std::vector<std::string> missing, misshapen, extra;
+  bool empty() const { return missing.empty() && misshapen.empty() && extra.empty(); }
+};
+
+Checkpoint::Checkpoint(const LoadOptions& options)
+    : geometry_(Safetensors::open(options.weights)),
+      skip_points_(!options.points),
+      allow_nonfinite_(options.allow_nonfinite) {
+  if (!options.decoder.empty()) decoder_ = Safetensors::open(options.decoder);
+  if (!options.overrides.empty()) overrides_ = Safetensors::open(options.overrides);
+  refuse_other_models();
+  has_decoder_ = decoder_.has_value() || any_name(geometry_, decoder_name);
+  has_point_head_ = options.points && any_name(geometry_, point_head_name);
+  settle_config(options);
+
+  const std::vector<TensorSpec> expected = expected_tensors();
+  Problems problems;
+  check_shapes(expected, problems);
+  check_extra(expected, options.strict, problems);
+  if (!problems.empty()) report(problems);
+
+  std::vector<std::string> converted;
+  for (const TensorSpec& spec : expected) {
+    const Found found = look_up(spec.name);
+    if (found.entry && found.entry->dtype != Dtype::kF32)
+      converted.push_back(spec.name + " (" + std::string(dtype_name(found.entry->dtype)) + ")");
+  }
+  if (!converted.empty())
+    warnings_.push_back(std::to_string(converted.size()) +
+                        " tensors are widened to float32: " + join(converted, kMostNamed));
+}
+
+void Checkpoint::refuse_other_models() const {
+  if (!any_name(geometry_, geometry_name)) {
+    if (any_name(geometry_, decoder_name))
+      fail(ErrorKind::kMismatch, geometry_.path(),
+           ": this is a semantic bridging decoder, not a geometry ",
+           "model; give it as the decoder and the geometry model as the weights");
+    fail(ErrorKind::kMismatch, geometry_.path(),
+         ": not a geometry model: ", resemblance(geometry_));
+  }
+  if (decoder_ && !any_name(*decoder_, decoder_name)) {
+    if (any_name(*decoder_, geometry_name))
+      fail(ErrorKind::kMismatch, decoder_->path(),
+           ": this is a geometry model, not a semantic bridging ",
+           "decoder; give it as the weights");
+    fail(ErrorKind::kMismatch, decoder_->path(),
+         ": not a semantic bridging decoder: ", resemblance(*decoder_));
+  }
+}
+
+void Checkpoint::settle_config(const LoadOptions& options) {
+  if (!options.config.empty()) {
+    config_ = load_config(options.config);
+    return;
+  }
+  // The decoder's own configuration, where there is one, knows more about it than the geometry's.
+  for (const Safetensors* file : {decoder_ ? &*decoder_ : nullptr, &geometry_}) {
+    if (file == nullptr) continue;
+    const auto found = file->metadata().find("config");
+    if (found == file->metadata().end() || !found->second.starts_with('{')) continue;
+    config_ = parse_config(found->second, file->path() + ": metadata \"config\"");
+    return;
+  }
+  config_ = infer_config(geometry_, decoder_ ? &*decoder_ : nullptr);
+  validate_config(config_, geometry_.path() + ": the configuration that its shapes tell");
+}
+
+std::vector<TensorSpec> Checkpoint::expected_tensors() const {
+  std::vector<TensorSpec> expected = geometry_tensors(config_);
+  if (has_decoder_)
+    for (TensorSpec& spec : decoder_tensors(config_)) expected.push_back(std::move(spec));
+  std::erase_if(expected, [&](const TensorSpec& spec) {
+    return known_unused_tensor(spec.name) || (!has_point_head_ && point_head_name(spec.name));
+  });
+  return expected;
+}
+
+Checkpoint::Found Checkpoint::look_up(const std::string& name) const {
+  if (overrides_)
+    if (const TensorEntry* entry = overrides_->find("weight." + name)) return {&*overrides_, entry};
+  if (decoder_ && decoder_name(name)) return {&*decoder_, decoder_->find(name)};
+  return {&geometry_, geometry_.find(name)};
+}
+
+Checkpoint::Found Checkpoint::find(const std::string& name) const {
+  const Found found = look_up(name);
+  LVGGT_CHECK(found.entry != nullptr, found.file->path(), ": tensor ", name, " is missing");
+  return found;
+}
+
+void Checkpoint::check_shapes(const std::vector<TensorSpec>& expected, Problems& problems) const {
+  for (const TensorSpec& spec : expected) {
+    const Found found = look_up(spec.name);
+    if (found.entry == nullptr) {
+      problems.missing.push_back(spec.name);
+    } else if (found.entry->shape != spec.shape) {
+      problems.misshapen.push_back(
+          spec.name + " is " + shape_text(found.entry->shape) + " where " + shape_text(spec.shape) +
+          " is expected" +
+          (looks_transposed(found.entry->shape, spec.shape) ? " (it looks transposed)" : ""));
+    } else if (!is_floating(found.entry->dtype)) {
+      problems.misshapen.push_back(spec.name + " holds " +
+                                   std::string(dtype_name(found.entry->dtype)) +
+                                   " values where floating-point ones are expected");
+    }
+  }
+}
+
+void Checkpoint::check_extra(const std::vector<TensorSpec>& expected, bool strict,
+                             Problems& problems) {
+  std::set<std::string_view> names;
+  for (const TensorSpec& spec : expected) names.insert(spec.name);
+  std::vector<std::string> extra;
+  const auto scan = [&](const Safetensors& file, bool takes_decoder_names) {
+    for (const TensorEntry& entry : file.entries()) {
+      const bool used =
+          names.contains(entry.name) && decoder_name(entry.name) == takes_decoder_names;
+      if (used || known_unused_tensor(entry.name) || (skip_points_ && point_head_name(entry.name)))
+        continue;
+      if (!decoder_ && names.contains(entry.name)) continue;
+      extra.push_back(entry.name);
+    }
+  };
+  scan(geometry_, false);
+  if (decoder_) scan(*decoder_, true);
+  if (extra.empty()) return;
+  if (strict) {
+    problems.extra = std::move(extra);
+  } else {
+    warnings_.push_back(
+        std::to_string(extra.size()) +
+        " tensors are not part of the configuration and are ignored: " + join(extra, extra.size()));
+  }
+}
+
+void Checkpoint::report(const Problems& problems) const {
+  std::string text = geometry_.path();
+  if (decoder_) text += " and " + decoder_->path();
+  const char* separator = ": ";
+  const auto add = [&](const std::vector<std::string>& list, const char* what) {
+    if (list.empty()) return;
+    text += separator + std::to_string(list.size()) + what + join(list, list.size());
+    separator = "; ";
+  };
+  add(problems.missing, " tensors are missing: ");
+  add(problems.misshapen, " tensors do not fit the configuration: ");
+  add(problems.extra, " tensors are not part of the configuration: ");
+  ModelConfig found = infer_config(geometry_, decoder_ ? &*decoder_ : nullptr, config_);
+  // Shapes do not tell these.
+  found.dino_heads = config_.dino_heads;
+  found.cam_heads = config_.cam_heads;
+  found.taps = config_.taps;
+  if (!found.agg_qk_norm) found.agg_heads = config_.agg_heads;
+  const std::string difference = config_difference(found, config_);
+  if (!difference.empty())
+    text +=
+        std::string("; the files look like another model than the configuration: ") + difference;
+  fail(ErrorKind::kMismatch, text);
+}
+
+void Checkpoint::inspect(const std::string& name, const Safetensors& file,
+                         std::span<const float> values) const {
+  std::size_t nonfinite = 0, zero = 0, denormal = 0;
+  for (const float value : values) {
+    const float magnitude = std::abs(value);
+    nonfinite += !(magnitude <= std::numeric_limits<float>::max());
+    zero += magnitude == 0;
+    denormal += magnitude < std::numeric_limits<float>::min();
+  }
+  denormal -= zero;
+  if (nonfinite > 0 && !allow_nonfinite_)
+    fail(ErrorKind::kNumeric, file.path(), ": tensor ", name, " has ", nonfinite, " values of ",
+         values.size(), " that are NaN or infinite");
+  const std::lock_guard lock(mutex_);
+  if (nonfinite > 0) nonfinite_.push_back(name);
+  if (!values.empty() && zero == values.size()) all_zero_.push_back(name);
+  if (static_cast<double>(denormal) > kDenormalShare * static_cast<double>(values.size()))
+    denormal_.push_back(name);
+}
+
+std::vector<std::string> Checkpoint::warnings() const {
+  std::vector<std::string> result = warnings_;
+  const std::lock_guard lock(mutex_);
+  // Loading in parallel finds them in any order.
+  for (auto* names : {&all_zero_, &denormal_, &nonfinite_}) std::sort(names->begin(), names->end());
+  const auto add = [&](const std::vector<std::string>& names, const char* what) {
+    if (!names.empty())
+      result.push_back(std::to_string(names.size()) + what + join(names, kMostNamed));
+  };
+  add(all_zero_, " tensors are all zero: ");
+  add(denormal_, " tensors have many denormal values, which compute slowly: ");
+  add(nonfinite_, " tensors have NaN or infinite values: ");
+  return result;
+}
+
+}  // namespace lvggt
