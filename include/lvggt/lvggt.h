@@ -63,4 +63,5 @@
 #include "lvggt/model/config.h"
 #include "lvggt/model/deterministic_weights.h"
 #include "lvggt/model/lang_vggt.h"
+#include "lvggt/model/stream.h"
 #include "lvggt/model/tensor_list.h"

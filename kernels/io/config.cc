@@ -318,9 +318,9 @@ std::string to_json(const ModelConfig& config) {
 }
 
 std::string config_difference(const ModelConfig& found, const ModelConfig& expected) {
-  const Json other = json_of(expected);
+  const Json found_json = json_of(found), other = json_of(expected);
   std::string text;
-  for (const auto& item : json_of(found).items())
+  for (const auto& item : found_json.items())
     if (item.key() != "name" && item.value() != other.at(item.key()))
       text += (text.empty() ? "" : "; ") + item.key() + " is " + item.value().dump() + ", not " +
               other.at(item.key()).dump();
