@@ -39,8 +39,9 @@
 //
 //   core/      Shape, View, Tensor; Error; Context (threads, scratch memory)
 //   model/     LangVggt, Stream, Frame; ModelConfig; names and shapes of the weights
-//   io/        pictures, folders and preprocessing; safetensors; output files
+//   io/        pictures, folders and preprocessing; safetensors; PLY, COLMAP, cameras.json, PNG
 //   geometry/  Camera, unprojection, confidence filter
+//   field/     coloured and language-featured clouds, colours of semantic maps, contact sheets
 //   kernels/   the operators the model is made of; not included here
 //
 // Shapes are written beside every declaration, channels last: [H, W, C] and [B, H, W, C].
@@ -52,12 +53,25 @@
 #include "lvggt/core/parallel.h"
 #include "lvggt/core/shape.h"
 #include "lvggt/core/tensor.h"
+#include "lvggt/field/color_map.h"
+#include "lvggt/field/contact_sheet.h"
+#include "lvggt/field/label.h"
+#include "lvggt/field/point_cloud.h"
+#include "lvggt/field/semantic_colors.h"
 #include "lvggt/geometry/camera.h"
 #include "lvggt/geometry/confidence.h"
 #include "lvggt/geometry/unproject.h"
 #include "lvggt/io/atomic_file.h"
+#include "lvggt/io/cameras_json.h"
+#include "lvggt/io/colmap.h"
+#include "lvggt/io/depth_png.h"
+#include "lvggt/io/dtype.h"
 #include "lvggt/io/frame_source.h"
 #include "lvggt/io/image.h"
+#include "lvggt/io/limits.h"
+#include "lvggt/io/original_camera.h"
+#include "lvggt/io/ply.h"
+#include "lvggt/io/png.h"
 #include "lvggt/io/preprocess.h"
 #include "lvggt/io/safetensors.h"
 #include "lvggt/model/config.h"
