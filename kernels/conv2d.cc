@@ -3,22 +3,22 @@
 
 #include <algorithm>
 
+#include "kernels/pack.h"
 #include "kernels/product.h"
 
 namespace lvggt {
 
-PackedConv2d pack_conv2d(View<const float, 4> weight, std::int64_t stride, std::int64_t padding) {
+PackedConv2d pack_conv2d(View<const float, 4> weight, std::int64_t stride, std::int64_t padding,
+                         Storage storage) {
   const auto [Cout, Cin, kernel, kernel_x] = weight.shape();
   LVGGT_CHECK(kernel == kernel_x, "conv2d: weight ", weight.shape(), " does not have a square kernel");
   const std::int64_t taps = kernel * kernel;
-  PackedConv2d packed{Cin, kernel, stride, padding,
-                      {Cout, taps, Cin, Tensor<float, 3>(Shape{num_panels(Cout), taps * Cin, kPanelWidth})}};
+  PackedConv2d packed{Cin, kernel, stride, padding, kernels::empty_matrix(Cout, taps, Cin, storage)};
   for (std::int64_t n = 0; n < Cout; ++n) {
     const View<const float, 3> filter = weight[n];
-    float* lines = packed.matrix.panels.data() + n / kPanelWidth * taps * Cin * kPanelWidth + n % kPanelWidth;
     for (std::int64_t t = 0; t < taps; ++t) {
       for (std::int64_t c = 0; c < Cin; ++c) {
-        lines[(t * Cin + c) * kPanelWidth] = filter(c, t / kernel, t % kernel);
+        kernels::set_weight(packed.matrix, n, t * Cin + c, filter(c, t / kernel, t % kernel));
       }
     }
   }

@@ -1,23 +1,23 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "lvggt/kernels/conv_transpose2d.h"
 
+#include "kernels/pack.h"
 #include "kernels/product.h"
-#include "lvggt/kernels/linear.h"
 
 namespace lvggt {
 
-PackedConvTranspose2d pack_conv_transpose2d(View<const float, 4> weight) {
+PackedConvTranspose2d pack_conv_transpose2d(View<const float, 4> weight, Storage storage) {
   const auto [Cin, Cout, kernel, kernel_x] = weight.shape();
   LVGGT_CHECK(kernel == kernel_x, "conv_transpose2d: weight ", weight.shape(),
               " does not have a square kernel");
   PackedConvTranspose2d packed{Cin, Cout, kernel, {}};
-  Tensor<float, 2> place(Shape{Cout, Cin});
   for (std::int64_t ky = 0; ky < kernel; ++ky) {
     for (std::int64_t kx = 0; kx < kernel; ++kx) {
+      PackedMatrix place = kernels::empty_matrix(Cout, 1, Cin, storage);
       for (std::int64_t n = 0; n < Cout; ++n) {
-        for (std::int64_t c = 0; c < Cin; ++c) place(n, c) = weight(c, n, ky, kx);
+        for (std::int64_t c = 0; c < Cin; ++c) kernels::set_weight(place, n, c, weight(c, n, ky, kx));
       }
-      packed.places.push_back(pack_linear(place));
+      packed.places.push_back(std::move(place));
     }
   }
   return packed;

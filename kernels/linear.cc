@@ -5,17 +5,6 @@
 
 namespace lvggt {
 
-PackedMatrix pack_linear(View<const float, 2> weight) {
-  const auto [N, K] = weight.shape();
-  PackedMatrix packed{N, 1, K, Tensor<float, 3>(Shape{num_panels(N), K, kPanelWidth})};
-  for (std::int64_t n = 0; n < N; ++n) {
-    const float* row = weight.data() + n * weight.stride(0);
-    float* lines = packed.panels.data() + n / kPanelWidth * K * kPanelWidth + n % kPanelWidth;
-    for (std::int64_t k = 0; k < K; ++k) lines[k * kPanelWidth] = row[k];
-  }
-  return packed;
-}
-
 void linear_forward(View<float, 2> y, View<const float, 2> x, const PackedMatrix& w,
                     const Epilogue<2>& epilogue, Context& ctx) {
   const auto [M, K] = x.shape();
@@ -33,17 +22,19 @@ void linear_forward(View<float, 2> y, View<const float, 2> x, const PackedMatrix
   const View<const float, 2> residual = epilogue.residual;
   const kernels::Product product{M, &w, 1, K, epilogue.bias.data(), epilogue.activation,
                                  epilogue.gamma.data(), !residual.empty()};
-  kernels::run_product(
-      product,
-      [&](const kernels::RowTable& table) {
-        for (std::int64_t r = 0; r < table.count; ++r) {
-          const std::int64_t m = table.begin + r;
-          table.x[r] = x.data() + m * x.stride(0);
-          table.y[r] = y.data() + m * y.stride(0);
-          if (residual) table.residual[r] = residual.data() + m * residual.stride(0);
-        }
-      },
-      ctx);
+  const auto gather = [&](const kernels::RowTable& table) {
+    for (std::int64_t r = 0; r < table.count; ++r) {
+      const std::int64_t m = table.begin + r;
+      table.x[r] = x.data() + m * x.stride(0);
+      table.y[r] = y.data() + m * y.stride(0);
+      if (residual) table.residual[r] = residual.data() + m * residual.stride(0);
+    }
+  };
+  if (w.storage == Storage::kI8) {
+    kernels::run_product_int8(product, x, gather, ctx);
+  } else {
+    kernels::run_product(product, gather, ctx);
+  }
 }
 
 }  // namespace lvggt

@@ -8,33 +8,24 @@
 #include "hwy/foreach_target.h"
 //
 #include "hwy/highway.h"
-#include "kernels/math-inl.h"
+#include "kernels/epilogue-inl.h"
 #include "kernels/simd-inl.h"
+#include "kernels/storage-inl.h"
 #include "kernels/tile-inl.h"
 
 #ifndef LVGGT_PRODUCT_ONCE
 #define LVGGT_PRODUCT_ONCE
 namespace lvggt::kernels {
 
-// A chunk is the unit of parallel work and of reuse: kChunkRows rows times kChunkPanels panels.
-//  - its inputs for one K block (96 x 256 floats, 96 KiB) and its sums (96 x 384 floats, 144 KiB) stay in a
-//    second-level cache of 512 KiB together with the panels in use;
-//  - a panel line group is read from there once for all 96 rows;
-//  - 782 tokens x 3072 channels give 72 chunks: enough for dozens of threads to balance.
-inline constexpr std::int64_t kChunkRows = 96;  // a multiple of every tile's rows
-inline constexpr std::int64_t kChunkPanels = 24;
-// Lines of a panel summed before moving on: 256 lines of one panel are 16 KiB, half of a first-level cache.
-inline constexpr std::int64_t kBlockK = 256;
-// Row pitch of copied inputs: not a multiple of 4 KiB, so that rows do not compete for the same cache sets.
-inline constexpr std::int64_t kInputPitch = kBlockK + 16;
-inline constexpr std::int64_t kSumPitch = kChunkPanels * kPanelWidth + 16;
-
 // What one worker needs for one chunk.
 struct ChunkScratch {
   float* input = nullptr;             // [kChunkRows, kInputPitch]
   float* sums = nullptr;              // [kChunkRows, kSumPitch]
   const float** input_rows = nullptr;  // [kChunkRows]
+  float* widened = nullptr;            // [kTilePanels, kBlockK, 16]: lines of narrow weights as floats
 };
+// Panels of the widest tile of any instruction set.
+inline constexpr std::int64_t kMaxTilePanels = 3;
 
 }  // namespace lvggt::kernels
 #endif
@@ -42,46 +33,6 @@ struct ChunkScratch {
 HWY_BEFORE_NAMESPACE();
 namespace lvggt::kernels::HWY_NAMESPACE {
 namespace {
-
-template <Activation kActivation>
-HWY_INLINE hn::Vec<Floats> activate(Floats d, hn::Vec<Floats> x) {
-  if constexpr (kActivation == Activation::kRelu) return hn::IfThenZeroElse(hn::Lt(x, hn::Zero(d)), x);
-  if constexpr (kActivation == Activation::kGelu) return gelu(d, x);
-  if constexpr (kActivation == Activation::kSilu) return silu(d, x);
-  if constexpr (kActivation == Activation::kSigmoid) return sigmoid(d, x);
-  return x;
-}
-
-// The epilogue of rows [first, last) of a chunk and channels [n0, n1).
-template <Activation kActivation>
-void finish(const Product& p, const RowTable& table, const float* HWY_RESTRICT sums, std::int64_t first,
-            std::int64_t last, std::int64_t n0, std::int64_t n1) {
-  const Floats d;
-  for (std::int64_t r = first; r < last; ++r) {
-    const float* HWY_RESTRICT sum = sums + r * kSumPitch;
-    float* y = table.y[r];
-    for (std::int64_t n = n0; n < n1; n += kLanes, sum += kLanes) {
-      const std::int64_t left = n1 - n;
-      auto v = hn::LoadU(d, sum);
-      if (p.bias) v = hn::Add(v, load_first(d, p.bias + n, left));
-      v = activate<kActivation>(d, v);
-      if (p.gamma) v = hn::Mul(v, load_first(d, p.gamma + n, left));
-      if (p.has_residual) v = hn::Add(v, load_first(d, table.residual[r] + n, left));
-      store_first(v, d, y + n, left);
-    }
-  }
-}
-
-void finish_any(const Product& p, const RowTable& table, const float* sums, std::int64_t first,
-                std::int64_t last, std::int64_t n0, std::int64_t n1) {
-  switch (p.activation) {
-    case Activation::kNone: return finish<Activation::kNone>(p, table, sums, first, last, n0, n1);
-    case Activation::kRelu: return finish<Activation::kRelu>(p, table, sums, first, last, n0, n1);
-    case Activation::kGelu: return finish<Activation::kGelu>(p, table, sums, first, last, n0, n1);
-    case Activation::kSilu: return finish<Activation::kSilu>(p, table, sums, first, last, n0, n1);
-    case Activation::kSigmoid: return finish<Activation::kSigmoid>(p, table, sums, first, last, n0, n1);
-  }
-}
 
 // Copies [k0, k1) of the chunk's rows of one tap side by side, and points the row table there.
 void copy_inputs(const RowTable& table, std::int64_t tap, std::int64_t k0, std::int64_t k1,
@@ -97,23 +48,44 @@ void copy_inputs(const RowTable& table, std::int64_t tap, std::int64_t k0, std::
   }
 }
 
+struct Panels {
+  const float* lines;
+  std::int64_t stride;  // floats between two panels
+};
+
+// Lines [line, line + num_lines) of `count` panels from `panel` on, widened if they are stored narrow.
+Panels block_panels(const Product& p, std::int64_t panel, std::int64_t count, std::int64_t line,
+                    std::int64_t num_lines, const ChunkScratch& scratch) {
+  const std::int64_t panel_lines = p.taps * p.K;
+  const std::int64_t first = (panel * panel_lines + line) * kPanelWidth;
+  if (p.w->storage == Storage::kF32) {
+    return {reinterpret_cast<const float*>(p.w->panels.data()) + first, panel_lines * kPanelWidth};
+  }
+  for (std::int64_t i = 0; i < count; ++i) {
+    widen_lines(p.w->storage, p.w->panels.data() + 2 * (first + i * panel_lines * kPanelWidth), num_lines,
+                scratch.widened + i * kBlockK * kPanelWidth);
+  }
+  return {scratch.widened, kBlockK * kPanelWidth};
+}
+
 // One K block: `taps` taps of K values each, for all rows and panels of the chunk. The rows' table has
 // row_stride addresses a tap; `lines` is where the block starts inside a panel.
 void run_block(const Product& p, const RowTable& table, std::int64_t panel0, std::int64_t panel1,
                const float* const* rows, std::int64_t row_stride, std::int64_t taps, std::int64_t K,
                std::int64_t lines, bool is_first, bool is_last, const ChunkScratch& scratch) {
-  const std::int64_t panel_stride = p.taps * p.K * kPanelWidth;
   for_panel_groups(panel1 - panel0, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
-    const float* panels = p.w->panels.data() + (panel0 + first) * panel_stride + lines * kPanelWidth;
+    const Panels panels = block_panels(p, panel0 + first, count, lines, taps * K, scratch);
     float* sums = scratch.sums + first * kPanelWidth;
     const std::int64_t n0 = (panel0 + first) * kPanelWidth;
     const std::int64_t n1 = std::min(p.w->N, n0 + count * kPanelWidth);
     for (std::int64_t r = 0; r < table.count; r += kTileRows) {
       float* out = sums + r * kSumPitch;
       if (is_first) {
-        tile_of<false>(count, rows + r, row_stride, taps, K, panels, panel_stride, out, kSumPitch);
+        tile_of<false>(count, rows + r, row_stride, taps, K, panels.lines, panels.stride, out,
+                       kSumPitch);
       } else {
-        tile_of<true>(count, rows + r, row_stride, taps, K, panels, panel_stride, out, kSumPitch);
+        tile_of<true>(count, rows + r, row_stride, taps, K, panels.lines, panels.stride, out,
+                       kSumPitch);
       }
       if (is_last) finish_any(p, table, sums, r, std::min(table.count, r + kTileRows), n0, n1);
     }
@@ -168,6 +140,9 @@ void run_product(const Product& product, FunctionRef<void(const RowTable&)> gath
   const auto input_rows = ctx.arena().alloc<const float*>(Shape{workers, kChunkRows});
   const auto x_rows = ctx.arena().alloc<const float*>(Shape{workers, product.taps, kChunkRows});
   const auto y_rows = ctx.arena().alloc<float*>(Shape{workers, kChunkRows});
+  const bool narrow = w.storage != Storage::kF32;
+  const auto widened =
+      ctx.arena().alloc(Shape{workers, narrow ? kMaxTilePanels * kBlockK * kPanelWidth : 0});
   const auto residual_rows = ctx.arena().alloc<const float*>(Shape{workers, kChunkRows});
 
   const auto run = HWY_DYNAMIC_DISPATCH(run_chunk);
@@ -190,7 +165,7 @@ void run_product(const Product& product, FunctionRef<void(const RowTable&)> gath
         }
         const std::int64_t panel0 = chunk % panel_chunks * kChunkPanels;
         run(product, table, panel0, std::min(panels, panel0 + kChunkPanels),
-            {inputs[worker].data(), sums[worker].data(), input_rows[worker].data()});
+            {inputs[worker].data(), sums[worker].data(), input_rows[worker].data(), widened[worker].data()});
       },
       ctx);
 }

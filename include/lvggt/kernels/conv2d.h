@@ -16,8 +16,9 @@ struct PackedConv2d {
   PackedMatrix matrix;  // taps = kernel^2 (row-major), K = in_channels
 };
 
-// weight: [Cout, Cin, k, k], as PyTorch stores it.
-PackedConv2d pack_conv2d(View<const float, 4> weight, std::int64_t stride, std::int64_t padding);
+// weight: [Cout, Cin, k, k], as PyTorch stores it; int8 is refused.
+PackedConv2d pack_conv2d(View<const float, 4> weight, std::int64_t stride, std::int64_t padding,
+                         Storage storage = Storage::kF32);
 
 // Extent of the output along one axis: floor((in + 2 padding - kernel) / stride) + 1.
 constexpr std::int64_t conv2d_extent(std::int64_t in, std::int64_t kernel, std::int64_t stride,

@@ -17,8 +17,8 @@ struct PackedConvTranspose2d {
   std::vector<PackedMatrix> places;  // [ky * k + kx]: N = Cout, K = Cin
 };
 
-// weight: [Cin, Cout, k, k], as PyTorch stores it.
-PackedConvTranspose2d pack_conv_transpose2d(View<const float, 4> weight);
+// weight: [Cin, Cout, k, k], as PyTorch stores it; int8 is refused.
+PackedConvTranspose2d pack_conv_transpose2d(View<const float, 4> weight, Storage storage = Storage::kF32);
 
 // y[b, k*i + ky, k*j + kx, :] = sum over Cin of x[b, i, j, :] w[:, :, ky, kx] + bias, channels last; pixels
 // may be strided.
