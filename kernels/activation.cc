@@ -18,16 +18,14 @@ namespace {
 
 template <class Function>
 void map_row(float* y, const float* x, std::int64_t count, const Function& function) {
-  for_each_vector(count, [=](auto d, std::int64_t i) HWY_ATTR {
-    hn::StoreU(function(d, hn::LoadU(d, x + i)), d, y + i);
-  });
+  for_each_vector(count, [=](auto d, std::int64_t i)
+                             HWY_ATTR { hn::StoreU(function(d, hn::LoadU(d, x + i)), d, y + i); });
 }
 
 // x <= 0 ? 0 : x rather than Max, which on x86 would turn NaN into 0.
 void relu_row(float* y, const float* x, std::int64_t count) {
-  map_row(y, x, count, [](auto d, auto v) HWY_ATTR {
-    return hn::IfThenZeroElse(hn::Le(v, hn::Zero(d)), v);
-  });
+  map_row(y, x, count,
+          [](auto d, auto v) HWY_ATTR { return hn::IfThenZeroElse(hn::Le(v, hn::Zero(d)), v); });
 }
 void gelu_row(float* y, const float* x, std::int64_t count) {
   map_row(y, x, count, [](auto d, auto v) HWY_ATTR { return gelu(d, v); });
@@ -38,8 +36,8 @@ void silu_row(float* y, const float* x, std::int64_t count) {
 void sigmoid_row(float* y, const float* x, std::int64_t count) {
   map_row(y, x, count, [](auto d, auto v) HWY_ATTR { return sigmoid(d, v); });
 }
-// Pixels handled at a time by the heads' activations, whose channels are too few to be vectors: a channel
-// is gathered into a small array, mapped there, and written where it belongs.
+// Pixels handled at a time by the heads' activations, whose channels are too few to be vectors: a
+// channel is gathered into a small array, mapped there, and written where it belongs.
 constexpr std::int64_t kBlock = 256;
 
 // y[i] = function(x[i * stride])
@@ -57,9 +55,8 @@ HWY_INLINE void map_channel(float* HWY_RESTRICT y, const float* HWY_RESTRICT x, 
 void depth_rows(float* depth, float* confidence, const float* x, std::int64_t stride,
                 std::int64_t count) {
   map_channel(depth, x, stride, count, [](auto d, auto v) HWY_ATTR { return exp(d, v); });
-  map_channel(confidence, x + 1, stride, count, [](auto d, auto v) HWY_ATTR {
-    return hn::Add(hn::Set(d, 1.0f), exp(d, v));
-  });
+  map_channel(confidence, x + 1, stride, count,
+              [](auto d, auto v) HWY_ATTR { return hn::Add(hn::Set(d, 1.0f), exp(d, v)); });
 }
 
 void point_rows(float* HWY_RESTRICT points, std::int64_t points_stride, float* confidence,
@@ -71,12 +68,12 @@ void point_rows(float* HWY_RESTRICT points, std::int64_t points_stride, float* c
       map_channel(coordinate, x + begin * stride + axis, stride, n, [](auto d, auto v) HWY_ATTR {
         return hn::CopySignToAbs(expm1(d, hn::Abs(v)), v);
       });
-      for (std::int64_t i = 0; i < n; ++i) points[(begin + i) * points_stride + axis] = coordinate[i];
+      for (std::int64_t i = 0; i < n; ++i)
+        points[(begin + i) * points_stride + axis] = coordinate[i];
     }
   }
-  map_channel(confidence, x + 3, stride, count, [](auto d, auto v) HWY_ATTR {
-    return hn::Add(hn::Set(d, 1.0f), exp(d, v));
-  });
+  map_channel(confidence, x + 3, stride, count,
+              [](auto d, auto v) HWY_ATTR { return hn::Add(hn::Set(d, 1.0f), exp(d, v)); });
 }
 
 }  // namespace
@@ -99,11 +96,16 @@ using RowFunction = void (*)(float*, const float*, std::int64_t);
 
 RowFunction row_function(Activation activation) {
   switch (activation) {
-    case Activation::kRelu: return &HWY_DYNAMIC_DISPATCH(relu_row);
-    case Activation::kGelu: return &HWY_DYNAMIC_DISPATCH(gelu_row);
-    case Activation::kSilu: return &HWY_DYNAMIC_DISPATCH(silu_row);
-    case Activation::kSigmoid: return &HWY_DYNAMIC_DISPATCH(sigmoid_row);
-    case Activation::kNone: break;
+    case Activation::kRelu:
+      return &HWY_DYNAMIC_DISPATCH(relu_row);
+    case Activation::kGelu:
+      return &HWY_DYNAMIC_DISPATCH(gelu_row);
+    case Activation::kSilu:
+      return &HWY_DYNAMIC_DISPATCH(silu_row);
+    case Activation::kSigmoid:
+      return &HWY_DYNAMIC_DISPATCH(sigmoid_row);
+    case Activation::kNone:
+      break;
   }
   return [](float* y, const float* x, std::int64_t count) {
     if (y != x) std::copy_n(x, count, y);
@@ -116,7 +118,8 @@ auto point_rows_function() { return &HWY_DYNAMIC_DISPATCH(point_rows); }
 }  // namespace
 }  // namespace kernels
 
-void activation_forward(View<float, 2> y, View<const float, 2> x, Activation activation, Context& ctx) {
+void activation_forward(View<float, 2> y, View<const float, 2> x, Activation activation,
+                        Context& ctx) {
   LVGGT_CHECK(y.shape() == x.shape(), "activation: y is ", y.shape(), " but x is ", x.shape());
   const auto function = kernels::row_function(activation);
   if (y.dense() && x.dense()) {
@@ -140,15 +143,15 @@ void activation_forward(View<float, 2> y, View<const float, 2> x, Activation act
 void depth_activation(View<float, 1> depth, View<float, 1> confidence, View<const float, 2> x,
                       Context& ctx) {
   const auto [N, C] = x.shape();
-  LVGGT_CHECK(C == 2 && depth.extent(0) == N && confidence.extent(0) == N, "depth_activation: x is ",
-              x.shape(), ", expected [N,2], with depth ", depth.shape(), " and confidence ",
-              confidence.shape());
+  LVGGT_CHECK(C == 2 && depth.extent(0) == N && confidence.extent(0) == N,
+              "depth_activation: x is ", x.shape(), ", expected [N,2], with depth ", depth.shape(),
+              " and confidence ", confidence.shape());
   const auto rows = kernels::depth_rows_function();
   parallel_rows(
       N, kernels::rows_per_chunk(2),
       [&](std::int64_t begin, std::int64_t end) {
-        rows(depth.data() + begin, confidence.data() + begin, x.data() + begin * x.stride(0), x.stride(0),
-             end - begin);
+        rows(depth.data() + begin, confidence.data() + begin, x.data() + begin * x.stride(0),
+             x.stride(0), end - begin);
       },
       ctx);
 }
@@ -157,8 +160,8 @@ void point_activation(View<float, 2> points, View<float, 1> confidence, View<con
                       Context& ctx) {
   const auto [N, C] = x.shape();
   LVGGT_CHECK(C == 4 && points.shape() == (Shape{N, std::int64_t{3}}) && confidence.extent(0) == N,
-              "point_activation: x is ", x.shape(), ", expected [N,4], with points ", points.shape(),
-              " and confidence ", confidence.shape());
+              "point_activation: x is ", x.shape(), ", expected [N,4], with points ",
+              points.shape(), " and confidence ", confidence.shape());
   const auto rows = kernels::point_rows_function();
   parallel_rows(
       N, kernels::rows_per_chunk(4),

@@ -20,7 +20,8 @@ void batch_norm2d_fold(View<float, 4> weight, View<float, 1> bias, View<const fl
       for (std::int64_t ky = 0; ky < weight.extent(2); ++ky)
         for (std::int64_t kx = 0; kx < weight.extent(3); ++kx)
           weight(c, i, ky, kx) = static_cast<float>(weight(c, i, ky, kx) * scale);
-    bias[c] = static_cast<float>((static_cast<double>(bias[c]) - running_mean[c]) * scale + beta[c]);
+    bias[c] =
+        static_cast<float>((static_cast<double>(bias[c]) - running_mean[c]) * scale + beta[c]);
   }
 }
 

@@ -56,8 +56,8 @@ auto add_row_function() { return &HWY_DYNAMIC_DISPATCH(add_row); }
 auto modulate_row_function() { return &HWY_DYNAMIC_DISPATCH(modulate_row); }
 auto all_finite_function() { return &HWY_DYNAMIC_DISPATCH(all_finite); }
 
-// Calls visit(pixel, channel, count) for tiles of up to 64 pixels of a row: the tile's pixels stay in L1 while
-// its channels are walked one by one (64 pixels of 128 channels are 32 KiB).
+// Calls visit(pixel, channel, count) for tiles of up to 64 pixels of a row: the tile's pixels stay
+// in L1 while its channels are walked one by one (64 pixels of 128 channels are 32 KiB).
 template <class Visit>
 void for_each_channel_run(std::int64_t W, std::int64_t C, const Visit& visit) {
   constexpr std::int64_t kTile = 64;
@@ -74,8 +74,8 @@ void check_planes(const char* op, const Shape<3>& planes, const Shape<3>& pixels
 }  // namespace kernels
 
 void add(View<float, 2> y, View<const float, 2> a, View<const float, 2> b, Context& ctx) {
-  LVGGT_CHECK(a.shape() == y.shape() && b.shape() == y.shape(), "add: y is ", y.shape(), " but a is ",
-              a.shape(), " and b is ", b.shape());
+  LVGGT_CHECK(a.shape() == y.shape() && b.shape() == y.shape(), "add: y is ", y.shape(),
+              " but a is ", a.shape(), " and b is ", b.shape());
   const auto row = kernels::add_row_function();
   parallel_rows(
       y.extent(0), kernels::rows_per_chunk(y.extent(1)),
@@ -97,8 +97,8 @@ void modulate(View<float, 2> y, View<const float, 2> x, View<const float, 2> shi
       y.extent(0), kernels::rows_per_chunk(y.extent(1)),
       [&](std::int64_t begin, std::int64_t end) {
         for (std::int64_t n = begin; n < end; ++n)
-          row(y[n].data(), x[n].data(), shift[n].data(), scale[n].data(), gate[n].data(), t[n].data(),
-              y.extent(1));
+          row(y[n].data(), x[n].data(), shift[n].data(), scale[n].data(), gate[n].data(),
+              t[n].data(), y.extent(1));
       },
       ctx);
 }
@@ -121,11 +121,13 @@ void to_planes(View<float, 3> planes, View<const float, 3> pixels, Context& ctx)
       planes.extent(1), kernels::rows_per_chunk(W * C),
       [&](std::int64_t begin, std::int64_t end) {
         for (std::int64_t h = begin; h < end; ++h)
-          kernels::for_each_channel_run(W, C, [&](std::int64_t w, std::int64_t c, std::int64_t count) {
-            const float* from = pixels[h][w].data() + c;
-            float* to = planes[c][h].data() + w;
-            for (std::int64_t i = 0; i < count; ++i) to[i] = from[i * step];
-          });
+          kernels::for_each_channel_run(W, C,
+                                        [&](std::int64_t w, std::int64_t c, std::int64_t count) {
+                                          const float* from = pixels[h][w].data() + c;
+                                          float* to = planes[c][h].data() + w;
+                                          for (std::int64_t i = 0; i < count; ++i)
+                                            to[i] = from[i * step];
+                                        });
       },
       ctx);
 }
@@ -137,11 +139,13 @@ void from_planes(View<float, 3> pixels, View<const float, 3> planes, Context& ct
       planes.extent(1), kernels::rows_per_chunk(W * C),
       [&](std::int64_t begin, std::int64_t end) {
         for (std::int64_t h = begin; h < end; ++h)
-          kernels::for_each_channel_run(W, C, [&](std::int64_t w, std::int64_t c, std::int64_t count) {
-            const float* from = planes[c][h].data() + w;
-            float* to = pixels[h][w].data() + c;
-            for (std::int64_t i = 0; i < count; ++i) to[i * step] = from[i];
-          });
+          kernels::for_each_channel_run(W, C,
+                                        [&](std::int64_t w, std::int64_t c, std::int64_t count) {
+                                          const float* from = planes[c][h].data() + w;
+                                          float* to = pixels[h][w].data() + c;
+                                          for (std::int64_t i = 0; i < count; ++i)
+                                            to[i * step] = from[i];
+                                        });
       },
       ctx);
 }

@@ -3,8 +3,8 @@
 
 #undef HWY_TARGET_INCLUDE
 #define HWY_TARGET_INCLUDE "kernels/interpolate.cc"
-#include <hwy/foreach_target.h>
 #include <hwy/cache_control.h>
+#include <hwy/foreach_target.h>
 #include <hwy/highway.h>
 
 #include <algorithm>
@@ -50,15 +50,18 @@ HWY_INLINE void blend_streaming(float* HWY_RESTRICT y, const float* a, const flo
   }
 }
 
-// One output row from two input rows. The two input columns around an output pixel are blended vertically into
-// `columns` [2, C], which stays in L1, and are kept while the next output pixel needs them: when enlarging,
-// every input value is read from memory once and every output pixel costs one horizontal blend.
+// One output row from two input rows. The two input columns around an output pixel are blended
+// vertically into `columns` [2, C], which stays in L1, and are kept while the next output pixel
+// needs them: when enlarging, every input value is read from memory once and every output pixel
+// costs one horizontal blend.
 void bilinear_row(float* HWY_RESTRICT y, std::int64_t y_step, std::int64_t Wo, std::int64_t C,
                   const float* upper, const float* lower, std::int64_t x_step, float weight,
                   const LinearTap* taps, float* columns, bool past_caches) {
   const std::int64_t lanes = static_cast<std::int64_t>(hn::Lanes(hn::ScalableTag<float>()));
-  const bool streaming = past_caches && C % lanes == 0 && y_step % lanes == 0 &&
-                         reinterpret_cast<std::uintptr_t>(y) % (sizeof(float) * static_cast<std::uintptr_t>(lanes)) == 0;
+  const bool streaming =
+      past_caches && C % lanes == 0 && y_step % lanes == 0 &&
+      reinterpret_cast<std::uintptr_t>(y) % (sizeof(float) * static_cast<std::uintptr_t>(lanes)) ==
+          0;
   float* left = columns;
   float* right = columns + C;
   std::int64_t left_idx = -1, right_idx = -1;
@@ -107,25 +110,29 @@ namespace {
 
 HWY_EXPORT(bilinear_row);
 HWY_EXPORT(weighted_sum);
-// Outputs of at least 32 MiB would be evicted before they are read again: writing them past the caches saves
-// fetching each line first (168x296 to 294x518, 256 channels, 2 threads: 14 ms against 26).
+// Outputs of at least 32 MiB would be evicted before they are read again: writing them past the
+// caches saves fetching each line first (168x296 to 294x518, 256 channels, 2 threads: 14 ms against
+// 26).
 constexpr std::int64_t kStreamingElements = std::int64_t{1} << 23;
 
 auto bilinear_row_function() { return &HWY_DYNAMIC_DISPATCH(bilinear_row); }
 auto weighted_sum_function() { return &HWY_DYNAMIC_DISPATCH(weighted_sum); }
 
-View<LinearTap, 1> linear_taps(std::int64_t out, std::int64_t in, bool align_corners, Arena& arena) {
+View<LinearTap, 1> linear_taps(std::int64_t out, std::int64_t in, bool align_corners,
+                               Arena& arena) {
   const View<LinearTap, 1> taps = arena.alloc<LinearTap>(Shape{out});
   for (std::int64_t i = 0; i < out; ++i) {
     double source = 0;
     if (align_corners) {
       if (out > 1) source = static_cast<double>(i * (in - 1)) / static_cast<double>(out - 1);
     } else {
-      source = (static_cast<double>(i) + 0.5) * static_cast<double>(in) / static_cast<double>(out) - 0.5;
+      source =
+          (static_cast<double>(i) + 0.5) * static_cast<double>(in) / static_cast<double>(out) - 0.5;
     }
     const double position = std::clamp(source, 0.0, static_cast<double>(in - 1));
     const auto low = static_cast<std::int64_t>(position);
-    taps[i] = {low, std::min(low + 1, in - 1), static_cast<float>(position - static_cast<double>(low))};
+    taps[i] = {low, std::min(low + 1, in - 1),
+               static_cast<float>(position - static_cast<double>(low))};
   }
   return taps;
 }
@@ -175,7 +182,8 @@ CubicTaps cubic_taps(std::int64_t out, std::int64_t in, Arena& arena) {
 
 void bilinear_forward(View<float, 4> y, View<const float, 4> x, bool align_corners, Context& ctx) {
   const std::int64_t B = y.extent(0), Ho = y.extent(1), Wo = y.extent(2), C = y.extent(3);
-  LVGGT_CHECK(x.extent(0) == B && x.extent(3) == C, "bilinear: y is ", y.shape(), " but x is ", x.shape());
+  LVGGT_CHECK(x.extent(0) == B && x.extent(3) == C, "bilinear: y is ", y.shape(), " but x is ",
+              x.shape());
   if (y.size() == 0) return;
   LVGGT_CHECK(x.size() > 0, "bilinear: x is empty, ", x.shape());
   const Arena::Scope scope(ctx.arena());
@@ -184,20 +192,21 @@ void bilinear_forward(View<float, 4> y, View<const float, 4> x, bool align_corne
   const auto columns = ctx.arena().alloc<float>(Shape{std::int64_t{ctx.num_threads()}, 2 * C});
   const auto row = kernels::bilinear_row_function();
   const bool past_caches = y.size() >= kernels::kStreamingElements;
-  // Up to eight neighbouring output rows to a chunk share their input rows in L2; at least 16 chunks, if there
-  // are as many rows, to balance the threads.
+  // Up to eight neighbouring output rows to a chunk share their input rows in L2; at least 16
+  // chunks, if there are as many rows, to balance the threads.
   const std::int64_t grain = std::clamp<std::int64_t>(B * Ho / 16, 1, 8);
-  parallel_chunks(
-      (B * Ho + grain - 1) / grain,
-      [&](std::int64_t chunk, int worker) {
-        for (std::int64_t n = chunk * grain; n < std::min(B * Ho, (chunk + 1) * grain); ++n) {
-          const auto& tap = rows[n % Ho];
-          const auto image = x[n / Ho];
-          row(y[n / Ho][n % Ho].data(), y.stride(2), Wo, C, image[tap.low].data(), image[tap.high].data(),
-              x.stride(2), tap.weight, taps.data(), columns[worker].data(), past_caches);
-        }
-      },
-      ctx);
+  parallel_chunks((B * Ho + grain - 1) / grain,
+                  [&](std::int64_t chunk, int worker) {
+                    for (std::int64_t n = chunk * grain; n < std::min(B * Ho, (chunk + 1) * grain);
+                         ++n) {
+                      const auto& tap = rows[n % Ho];
+                      const auto image = x[n / Ho];
+                      row(y[n / Ho][n % Ho].data(), y.stride(2), Wo, C, image[tap.low].data(),
+                          image[tap.high].data(), x.stride(2), tap.weight, taps.data(),
+                          columns[worker].data(), past_caches);
+                    }
+                  },
+                  ctx);
 }
 
 void bicubic_antialias_forward(View<float, 3> y, View<const float, 3> x, Context& ctx) {
@@ -225,8 +234,8 @@ void bicubic_antialias_forward(View<float, 3> y, View<const float, 3> x, Context
       [&](std::int64_t begin, std::int64_t end) {
         for (std::int64_t n = begin; n < end; ++n) {
           const std::int64_t h = n / Wo, w = n % Wo;
-          weighted_sum(y[h][w].data(), narrowed[down.first[h]][w].data(), Wo * C, down.weights[h].data(),
-                       down.count[h], C);
+          weighted_sum(y[h][w].data(), narrowed[down.first[h]][w].data(), Wo * C,
+                       down.weights[h].data(), down.count[h], C);
         }
       },
       ctx);

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-// Vector mathematics shared by the kernels: row loops with their remainder, exp, expm1, sigmoid, SiLU, GELU.
-// Included once for every instruction set (see hwy/foreach_target.h).
+// Vector mathematics shared by the kernels: row loops with their remainder, exp, expm1, sigmoid,
+// SiLU, GELU. Included once for every instruction set (see hwy/foreach_target.h).
 //
-// The polynomials are weighted minimax fits (Lawson's iteration on a Chebyshev basis in double, against 40
-// digit values), rounded to float. Errors are the worst measured over every 97th float of the
-// range named, on SSE4, AVX2 and AVX-512.
+// The polynomials are weighted minimax fits (Lawson's iteration on a Chebyshev basis in double,
+// against 40 digit values), rounded to float. Errors are the worst measured over every 97th float
+// of the range named, on SSE4, AVX2 and AVX-512.
 
 #if defined(LVGGT_KERNELS_MATH_INL_H_) == defined(HWY_TARGET_TOGGLE)
 #ifdef LVGGT_KERNELS_MATH_INL_H_
@@ -22,9 +22,9 @@ HWY_BEFORE_NAMESPACE();
 namespace lvggt::kernels::HWY_NAMESPACE {
 namespace hn = hwy::HWY_NAMESPACE;
 
-// Calls body(d, i) for consecutive, disjoint groups of Lanes(d) elements that cover [begin, end): full
-// vectors first, then at most one vector of each smaller power of two. Nothing outside is touched, so
-// the body may load and store whole vectors.
+// Calls body(d, i) for consecutive, disjoint groups of Lanes(d) elements that cover [begin, end):
+// full vectors first, then at most one vector of each smaller power of two. Nothing outside is
+// touched, so the body may load and store whole vectors.
 template <std::size_t kLanes, class Body>
 HWY_INLINE void for_each_remainder(std::int64_t begin, std::int64_t end, const Body& body) {
   const hn::CappedTag<float, kLanes> d;
@@ -39,8 +39,8 @@ HWY_INLINE void for_each_vector(std::int64_t count, const Body& body) {
   for_each_remainder<HWY_MAX_BYTES / sizeof(float)>(0, count, body);
 }
 
-// Sum over [0, count) of term(d, i), which returns the terms i .. i + Lanes(d) - 1. Four accumulators hide
-// the latency of the additions and make each partial sum short.
+// Sum over [0, count) of term(d, i), which returns the terms i .. i + Lanes(d) - 1. Four
+// accumulators hide the latency of the additions and make each partial sum short.
 template <std::size_t kLanes, class Term>
 HWY_INLINE float sum_remainder(std::int64_t begin, std::int64_t end, const Term& term) {
   const hn::CappedTag<float, kLanes> d;
@@ -70,8 +70,9 @@ HWY_INLINE float sum_vectors(std::int64_t count, const Term& term) {
          sum_remainder<HWY_MAX_BYTES / sizeof(float)>(i, count, term);
 }
 
-// x = n ln2 + r with |r| <= ln2 / 2. Adding 1.5 * 2^23 rounds to an integer and leaves n in the low bits of
-// the sum. ln2 is split so that n times the first part is exact for every |n| < 2^15, with or without FMA.
+// x = n ln2 + r with |r| <= ln2 / 2. Adding 1.5 * 2^23 rounds to an integer and leaves n in the low
+// bits of the sum. ln2 is split so that n times the first part is exact for every |n| < 2^15, with
+// or without FMA.
 template <class V>
 struct SplitExponent {
   V n;        // as a float
@@ -88,9 +89,9 @@ HWY_INLINE SplitExponent<V> split_exponent(D d, V x) {
   return {n, shifted, r};
 }
 
-// exp(x) for x <= 88.72 (where the result is finite), 0 below ln(2^-126) and for -inf. NaN for a NaN
-// whose low 9 bits are zero, the only one that arithmetic makes. Within 1.1 ulp. For the softmax, whose
-// argument is never positive.
+// exp(x) for x <= 88.72 (where the result is finite), 0 below ln(2^-126) and for -inf. NaN for a
+// NaN whose low 9 bits are zero, the only one that arithmetic makes. Within 1.1 ulp. For the
+// softmax, whose argument is never positive.
 template <class D, class V = hn::Vec<D>>
 HWY_INLINE V exp_nonpositive(D d, V x) {
   const SplitExponent<V> split = split_exponent(d, x);
@@ -109,12 +110,13 @@ HWY_INLINE V exp_nonpositive(D d, V x) {
   return hn::IfThenZeroElse(hn::Lt(x, hn::Set(d, -87.3365448f)), y);
 }
 
-// exp(x) for any x: infinity above 88.7228, 0 below -87.3365 (where the result would not be a normal
-// number), NaN for NaN. Within 1.1 ulp.
+// exp(x) for any x: infinity above 88.7228, 0 below -87.3365 (where the result would not be a
+// normal number), NaN for NaN. Within 1.1 ulp.
 template <class D, class V = hn::Vec<D>>
 HWY_INLINE V exp(D d, V x) {
   const V infinity = hn::Set(d, std::numeric_limits<float>::infinity());
-  return hn::IfThenElse(hn::Le(x, hn::Set(d, 88.7228394f)), exp_nonpositive(d, x), hn::Add(x, infinity));
+  return hn::IfThenElse(hn::Le(x, hn::Set(d, 88.7228394f)), exp_nonpositive(d, x),
+                        hn::Add(x, infinity));
 }
 
 // exp(x) - 1 without cancellation: infinity above 88.7228, -1 below -25, NaN for NaN. Within 1.5
@@ -133,7 +135,8 @@ HWY_INLINE V expm1(D d, V x) {
   const V expm1_r = hn::MulAdd(hn::Mul(r, r), p, r);
   // 2^n (exp(r) - 1) + (2^n - 1), computed at half its size because 2^128 is no float.
   const hn::RebindToSigned<D> di;
-  const auto exponent = hn::ShiftLeft<23>(hn::Add(hn::BitCast(di, split.shifted), hn::Set(di, 126)));
+  const auto exponent =
+      hn::ShiftLeft<23>(hn::Add(hn::BitCast(di, split.shifted), hn::Set(di, 126)));
   const V half_scale = hn::BitCast(d, exponent);
   V y = hn::MulAdd(half_scale, expm1_r, hn::Sub(half_scale, hn::Set(d, 0.5f)));
   y = hn::Add(y, y);
@@ -149,16 +152,17 @@ HWY_INLINE V sigmoid(D d, V x) {
   return hn::Div(one, hn::Add(one, exp(d, hn::Neg(x))));
 }
 
-// x / (1 + exp(-x)), NaN for NaN and, as in the reference, for -inf. Within 2.5 ulp down to x = -87.
+// x / (1 + exp(-x)), NaN for NaN and, as in the reference, for -inf. Within 2.5 ulp down to x =
+// -87.
 template <class D, class V = hn::Vec<D>>
 HWY_INLINE V silu(D d, V x) {
   return hn::Div(x, hn::Add(hn::Set(d, 1.0f), exp(d, hn::Neg(x))));
 }
 
-// x/2 (1 + erf(x / sqrt 2)) as max(x, 0) - h(|x|) with h(a) = a/2 erfc(a / sqrt 2) = a / (2 D(a)^8), where D
-// is a polynomial of degree 9 with D(0) = 1 (fit on [0, 6.2], error of h 9.1e-9). The tail needs no
-// exponential, and beyond 10 h is 0 to float accuracy. Absolute error within 1.8e-7 max(1, |x|); NaN for
-// NaN and for -inf.
+// x/2 (1 + erf(x / sqrt 2)) as max(x, 0) - h(|x|) with h(a) = a/2 erfc(a / sqrt 2) = a / (2
+// D(a)^8), where D is a polynomial of degree 9 with D(0) = 1 (fit on [0, 6.2], error of h 9.1e-9).
+// The tail needs no exponential, and beyond 10 h is 0 to float accuracy. Absolute error
+// within 1.8e-7 max(1, |x|); NaN for NaN and for -inf.
 template <class D, class V = hn::Vec<D>>
 HWY_INLINE V gelu(D d, V x) {
   const V half = hn::Set(d, 0.5f);

@@ -46,8 +46,10 @@ auto rope_head_function() { return &HWY_DYNAMIC_DISPATCH(rope_head); }
 }  // namespace
 }  // namespace kernels
 
-RopeTable make_rope_table(View<const std::int64_t, 2> positions, std::int64_t head_dim, float base) {
-  LVGGT_CHECK(positions.extent(1) == 2, "rope_2d: positions are ", positions.shape(), ", expected [P,2]");
+RopeTable make_rope_table(View<const std::int64_t, 2> positions, std::int64_t head_dim,
+                          float base) {
+  LVGGT_CHECK(positions.extent(1) == 2, "rope_2d: positions are ", positions.shape(),
+              ", expected [P,2]");
   LVGGT_CHECK(head_dim > 0 && head_dim % 4 == 0, "rope_2d: head_dim ", head_dim,
               " is not a multiple of 4");
   const std::int64_t P = positions.extent(0), half = head_dim / 2, quarter = head_dim / 4;
@@ -63,7 +65,8 @@ RopeTable make_rope_table(View<const std::int64_t, 2> positions, std::int64_t he
   return table;
 }
 
-void rope_2d_forward(View<float, 3> y, View<const float, 3> x, const RopeTable& table, Context& ctx) {
+void rope_2d_forward(View<float, 3> y, View<const float, 3> x, const RopeTable& table,
+                     Context& ctx) {
   const std::int64_t N = x.extent(0), heads = x.extent(1), D = x.extent(2), P = table.cos.extent(0);
   LVGGT_CHECK(y.shape() == x.shape(), "rope_2d: y is ", y.shape(), " but x is ", x.shape());
   LVGGT_CHECK(D % 4 == 0 && table.cos.extent(1) == D / 2, "rope_2d: x is ", x.shape(),
@@ -76,7 +79,8 @@ void rope_2d_forward(View<float, 3> y, View<const float, 3> x, const RopeTable& 
       [&](std::int64_t begin, std::int64_t end) {
         for (std::int64_t n = begin; n < end; ++n)
           for (std::int64_t h = 0; h < heads; ++h)
-            head(y[n][h].data(), x[n][h].data(), table.cos[n % P].data(), table.sin[n % P].data(), D / 4);
+            head(y[n][h].data(), x[n][h].data(), table.cos[n % P].data(), table.sin[n % P].data(),
+                 D / 4);
       },
       ctx);
 }

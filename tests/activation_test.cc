@@ -20,11 +20,11 @@ namespace {
 
 constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
 constexpr float kInfinity = std::numeric_limits<float>::infinity();
-constexpr Activation kAll[] = {Activation::kNone, Activation::kRelu, Activation::kGelu, Activation::kSilu,
-                               Activation::kSigmoid};
+constexpr Activation kAll[] = {Activation::kNone, Activation::kRelu, Activation::kGelu,
+                               Activation::kSilu, Activation::kSigmoid};
 
-// gelu: the documented error of the vector function. silu and sigmoid: exp to 2.2 u (u = 2^-24), a sum
-// and a quotient to 1 u each, and what is below the smallest normal number may become 0.
+// gelu: the documented error of the vector function. silu and sigmoid: exp to 2.2 u (u = 2^-24), a
+// sum and a quotient to 1 u each, and what is below the smallest normal number may become 0.
 double limit_of(Activation kind, double x, double expected) {
   if (kind == Activation::kGelu) return 1.8e-7 * std::max(1.0, std::abs(x));
   if (kind == Activation::kSilu) return 4.3 * kUnit * std::abs(expected) + 1.1e-36;
@@ -67,7 +67,8 @@ TEST_CASE("activation_forward: agrees with the definition in double over the who
   });
 }
 
-TEST_CASE("activation_forward: every length up to two vectors and one, dense and strided, in place") {
+TEST_CASE(
+    "activation_forward: every length up to two vectors and one, dense and strided, in place") {
   Context ctx(1);
   for_each_target([&] {
     for (std::int64_t C = 0; C <= 33; ++C) {
@@ -143,13 +144,16 @@ TEST_CASE("depth_activation: exp and 1 + exp of the two channels to 1.1 units in
   for_each_target([&] {
     for (const std::int64_t N : {0, 1, 7, 255, 257, 30000}) {
       CAPTURE(N);
-      const View<const float, 2> x = values.view().reshaped(Shape{30000, 2}).narrow(0, 30000 - N, 30000);
+      const View<const float, 2> x =
+          values.view().reshaped(Shape{30000, 2}).narrow(0, 30000 - N, 30000);
       Tensor<float, 1> depth(Shape{N}), confidence(Shape{N});
       depth_activation(depth, confidence, x, ctx);
       Tensor<double, 1> expected_depth(Shape{N}), expected_confidence(Shape{N});
       for (std::int64_t n = 0; n < N; ++n) {
         // Beyond the largest float the result is infinity, below the smallest normal one 0.
-        const auto exp_of = [](double v) { return v > 88.7228394 ? double{kInfinity} : std::exp(v); };
+        const auto exp_of = [](double v) {
+          return v > 88.7228394 ? double{kInfinity} : std::exp(v);
+        };
         expected_depth[n] = exp_of(x(n, 0));
         expected_confidence[n] = 1 + exp_of(x(n, 1));
       }
@@ -206,6 +210,8 @@ TEST_CASE("depth_activation, point_activation: a wrong number of channels is ref
   Context ctx(1);
   Tensor<float, 2> x(Shape{5, 3}), points(Shape{5, 3});
   Tensor<float, 1> depth(Shape{5}), confidence(Shape{5});
-  CHECK_THROWS_WITH_AS(depth_activation(depth, confidence, x, ctx), doctest::Contains("[5,3]"), Error);
-  CHECK_THROWS_WITH_AS(point_activation(points, confidence, x, ctx), doctest::Contains("[5,3]"), Error);
+  CHECK_THROWS_WITH_AS(depth_activation(depth, confidence, x, ctx), doctest::Contains("[5,3]"),
+                       Error);
+  CHECK_THROWS_WITH_AS(point_activation(points, confidence, x, ctx), doctest::Contains("[5,3]"),
+                       Error);
 }

@@ -23,14 +23,16 @@ namespace {
 class Groups {
  public:
   // Splits the tokens of k and v, [Nk, heads, D], into groups of the given sizes.
-  Groups(View<const float, 3> k, View<const float, 3> v, const std::vector<std::int64_t>& sizes, Context& ctx) {
+  Groups(View<const float, 3> k, View<const float, 3> v, const std::vector<std::int64_t>& sizes,
+         Context& ctx) {
     const std::int64_t heads = k.extent(1), D = k.extent(2);
     std::int64_t begin = 0;
     for (const std::int64_t size : sizes) {
       keys_.emplace_back(Shape{packed_keys_size(heads, size, D)});
       values_.emplace_back(Shape{packed_values_size(heads, size, D)});
       groups_.push_back({keys_.back().data(), values_.back().data(), heads, size, D});
-      pack_keys_values(groups_.back(), k.narrow(0, begin, begin + size), v.narrow(0, begin, begin + size), ctx);
+      pack_keys_values(groups_.back(), k.narrow(0, begin, begin + size),
+                       v.narrow(0, begin, begin + size), ctx);
       begin += size;
     }
   }
@@ -44,20 +46,23 @@ class Groups {
 double largest(View<const float, 3> x) {
   const Tensor<float, 3> dense = converted<float>(x);
   double m = 0;
-  for (std::int64_t i = 0; i < dense.size(); ++i) m = std::max(m, std::abs(double{dense.data()[i]}));
+  for (std::int64_t i = 0; i < dense.size(); ++i)
+    m = std::max(m, std::abs(double{dense.data()[i]}));
   return m;
 }
 
-// A score is off by at most (D + 4) u times the sum of its products' magnitudes, here the largest of all. That
-// is the relative error of a weight before normalisation, which doubles it; the exponential and the
-// sums over the keys add 8 + Nk roundings, again doubled. The result is a mean of values.
+// A score is off by at most (D + 4) u times the sum of its products' magnitudes, here the largest
+// of all. That is the relative error of a weight before normalisation, which doubles it; the
+// exponential and the sums over the keys add 8 + Nk roundings, again doubled. The result is a mean
+// of values.
 double bound(View<const float, 3> q, View<const float, 3> k, View<const float, 3> v, float scale) {
   double score = 0;
   for (std::int64_t i = 0; i < q.extent(0); ++i)
     for (std::int64_t j = 0; j < k.extent(0); ++j)
       for (std::int64_t h = 0; h < q.extent(1); ++h) {
         double sum = 0;
-        for (std::int64_t d = 0; d < q.extent(2); ++d) sum += std::abs(double{q(i, h, d)} * k(j, h, d));
+        for (std::int64_t d = 0; d < q.extent(2); ++d)
+          sum += std::abs(double{q(i, h, d)} * k(j, h, d));
         score = std::max(score, scale * sum);
       }
   const double roundings = static_cast<double>(k.extent(0)) + 8;
@@ -76,14 +81,15 @@ void check(const Case& size, float magnitude, Context& ctx) {
   for (const std::int64_t group : size.groups) Nk += group;
   CAPTURE(Nk);
   // Slices of qkv buffers, as the model has them.
-  const auto q_buffer = random_tensor(Shape{size.Nq, 3 * size.heads, size.D}, 1, -magnitude, magnitude);
+  const auto q_buffer =
+      random_tensor(Shape{size.Nq, 3 * size.heads, size.D}, 1, -magnitude, magnitude);
   const auto kv_buffer = random_tensor(Shape{Nk, 3 * size.heads, size.D}, 2, -magnitude, magnitude);
   const View<const float, 3> q = q_buffer.view().narrow(1, 0, size.heads);
   const View<const float, 3> k = kv_buffer.view().narrow(1, size.heads, 2 * size.heads);
   const View<const float, 3> v = kv_buffer.view().narrow(1, 2 * size.heads, 3 * size.heads);
   const float scale = 1.0f / std::sqrt(static_cast<float>(size.D));
-  const auto expected = reference::attention(converted<double>(q), converted<double>(k), converted<double>(v),
-                                             static_cast<double>(scale));
+  const auto expected = reference::attention(converted<double>(q), converted<double>(k),
+                                             converted<double>(v), static_cast<double>(scale));
   Strided<3> y(q.shape());
   scaled_dot_product_attention(y.view(), q, Groups(k, v, size.groups, ctx).packed(), scale, ctx);
   CHECK_CLOSE(y.view(), expected, bound(q, k, v, scale));
@@ -114,7 +120,8 @@ TEST_CASE("attention: several groups are one set of keys, whatever their sizes")
 
 TEST_CASE("attention: the order of the groups changes nothing but rounding") {
   Context ctx(1);
-  const auto q = random_tensor(Shape{7, 2, 32}, 1), k = random_tensor(Shape{40, 2, 32}, 2), v = random_tensor(Shape{40, 2, 32}, 3);
+  const auto q = random_tensor(Shape{7, 2, 32}, 1), k = random_tensor(Shape{40, 2, 32}, 2),
+             v = random_tensor(Shape{40, 2, 32}, 3);
   for_each_target([&] {
     Tensor<float, 3> forwards(q.shape()), backwards(q.shape());
     const Groups groups(k, v, {7, 20, 13}, ctx);
@@ -149,7 +156,8 @@ TEST_CASE("attention: all scores far below zero weigh by their differences") {
     for (std::int64_t j = 0; j < 20; ++j) k(j, 0, 0) = -10;
     Tensor<float, 3> y(q.shape());
     scaled_dot_product_attention(y, q, Groups(k, v, {4, 16}, ctx).packed(), 1, ctx);
-    CHECK_CLOSE(y, reference::attention(in_double(q), in_double(k), in_double(v), 1.0), bound(q, k, v, 1));
+    CHECK_CLOSE(y, reference::attention(in_double(q), in_double(k), in_double(v), 1.0),
+                bound(q, k, v, 1));
   });
 }
 
@@ -181,20 +189,23 @@ TEST_CASE("attention: NaN in a query, a key or a value is seen in the result") {
   for_each_target([&] {
     const auto q = random_tensor(Shape{5, 2, 16}, 1), k = random_tensor(Shape{20, 2, 16}, 2);
     const auto v = random_tensor(Shape{20, 2, 16}, 3);
-    const auto attended = [&](const Tensor<float, 3>& q1, const Tensor<float, 3>& k1, const Tensor<float, 3>& v1) {
+    const auto attended = [&](const Tensor<float, 3>& q1, const Tensor<float, 3>& k1,
+                              const Tensor<float, 3>& v1) {
       Tensor<float, 3> y(q.shape());
       scaled_dot_product_attention(y, q1, Groups(k1, v1, {20}, ctx).packed(), 0.25f, ctx);
       return y;
     };
     auto bad_q = q.clone(), bad_k = k.clone(), bad_v = v.clone();
     bad_q(3, 1, 15) = bad_k(17, 1, 0) = bad_v(19, 1, 7) = kNan;
-    const auto y_q = attended(bad_q, k, v), y_k = attended(q, bad_k, v), y_v = attended(q, k, bad_v);
+    const auto y_q = attended(bad_q, k, v), y_k = attended(q, bad_k, v),
+               y_v = attended(q, k, bad_v);
     for (std::int64_t i = 0; i < 5; ++i)
       for (std::int64_t d = 0; d < 16; ++d) {
         CHECK(std::isnan(y_q(i, 1, d)) == (i == 3));
         CHECK(std::isnan(y_k(i, 1, d)));
         CHECK(std::isnan(y_v(i, 1, d)) == (d == 7));
-        CHECK_FALSE((std::isnan(y_q(i, 0, d)) || std::isnan(y_k(i, 0, d)) || std::isnan(y_v(i, 0, d))));
+        CHECK_FALSE(
+            (std::isnan(y_q(i, 0, d)) || std::isnan(y_k(i, 0, d)) || std::isnan(y_v(i, 0, d))));
       }
   });
 }
@@ -216,8 +227,10 @@ TEST_CASE("attention: shapes that do not fit are refused by name") {
   const auto k = random_tensor(Shape{6, 2, 16}, 1);
   const Groups groups(k, k, {6}, ctx);
   Tensor<float, 3> y(Shape{3, 2, 16}), short_head(Shape{3, 2, 8}), one_head(Shape{3, 1, 16});
-  CHECK_THROWS_WITH_AS(scaled_dot_product_attention(y, short_head, groups.packed(), 1, ctx), doctest::Contains("[3,2,8]"), Error);
+  CHECK_THROWS_WITH_AS(scaled_dot_product_attention(y, short_head, groups.packed(), 1, ctx),
+                       doctest::Contains("[3,2,8]"), Error);
   CHECK_THROWS_WITH_AS(scaled_dot_product_attention(one_head, one_head, groups.packed(), 1, ctx),
                        doctest::Contains("[3,1,16]"), Error);
-  CHECK_THROWS_WITH_AS(pack_keys_values(groups.packed()[0], k, y, ctx), doctest::Contains("[3,2,16]"), Error);
+  CHECK_THROWS_WITH_AS(pack_keys_values(groups.packed()[0], k, y, ctx),
+                       doctest::Contains("[3,2,16]"), Error);
 }

@@ -13,7 +13,8 @@ using namespace lvggt::test;
 
 namespace {
 
-Tensor<double, 4> conv_with_bias(const Tensor<float, 4>& x, const Tensor<float, 4>& w, const Tensor<float, 1>& bias) {
+Tensor<double, 4> conv_with_bias(const Tensor<float, 4>& x, const Tensor<float, 4>& w,
+                                 const Tensor<float, 1>& bias) {
   Tensor<double, 4> y = reference::conv2d(in_double(x), in_double(w), 1, 1);
   for (std::int64_t i = 0; i < y.size(); ++i) y.data()[i] += bias[i % bias.extent(0)];
   return y;
@@ -21,15 +22,16 @@ Tensor<double, 4> conv_with_bias(const Tensor<float, 4>& x, const Tensor<float, 
 
 }  // namespace
 
-TEST_CASE("batch_norm2d_fold: the folded convolution is the convolution followed by the batch norm") {
+TEST_CASE(
+    "batch_norm2d_fold: the folded convolution is the convolution followed by the batch norm") {
   const auto x = random_tensor(Shape{2, 5, 4, 3}, 1);
   auto w = random_tensor(Shape{7, 3, 3, 3}, 2);
   auto bias = random_tensor(Shape{7}, 3);
   const auto gamma = random_tensor(Shape{7}, 4), beta = random_tensor(Shape{7}, 5);
   const auto mean = random_tensor(Shape{7}, 6), variance = random_tensor(Shape{7}, 7, 0.001f, 2);
   const Tensor<double, 4> expected =
-      reference::batch_norm2d(conv_with_bias(x, w, bias), in_double(gamma), in_double(beta), in_double(mean),
-                              in_double(variance), static_cast<double>(1e-5f));
+      reference::batch_norm2d(conv_with_bias(x, w, bias), in_double(gamma), in_double(beta),
+                              in_double(mean), in_double(variance), static_cast<double>(1e-5f));
   batch_norm2d_fold(w, bias, gamma, beta, mean, variance, 1e-5f);
   // Each of the 27 weights (times |x| < 1) and the bias were rounded once.
   Tensor<double, 4> limit(expected.shape());

@@ -37,11 +37,13 @@ void check(const Kernel& kernel, const Size& size, const ProductParts& parts, Co
   const auto x = random_tensor(Shape{size.B, size.H, size.W, size.Cin}, 1);
   const auto w = random_tensor(Shape{size.Cout, size.Cin, kernel.k, kernel.k}, 2);
   auto sum = reference::conv2d(in_double(x), in_double(w), kernel.stride, kernel.padding);
-  const auto size_of_sum = reference::conv2d(magnitudes(x), magnitudes(w), kernel.stride, kernel.padding);
+  const auto size_of_sum =
+      reference::conv2d(magnitudes(x), magnitudes(w), kernel.stride, kernel.padding);
   CHECK(sum.extent(1) == conv2d_extent(size.H, kernel.k, kernel.stride, kernel.padding));
   const ProductOperands operands(parts, size.Cout);
   const auto residual = random_tensor(sum.shape(), 5);
-  const auto expected = expected_product(std::move(sum), size_of_sum, size.Cin * kernel.k * kernel.k, operands, residual);
+  const auto expected = expected_product(std::move(sum), size_of_sum,
+                                         size.Cin * kernel.k * kernel.k, operands, residual);
   Strided<4> sx(x.view()), y(residual.view());
   Epilogue<4> epilogue = operands.epilogue<4>();
   if (parts.residual) epilogue.residual = y.view();  // y may be the residual
@@ -52,15 +54,19 @@ void check(const Kernel& kernel, const Size& size, const ProductParts& parts, Co
 
 }  // namespace
 
-TEST_CASE("conv2d_forward: agrees with the definition for every kernel of the model and odd sizes") {
+TEST_CASE(
+    "conv2d_forward: agrees with the definition for every kernel of the model and odd sizes") {
   Context ctx(2);
   for_each_target([&] {
     for (const Kernel& kernel : kKernels) {
       const std::int64_t unit = kernel.k == 14 ? 14 : 1;
-      for (const Size& size : {Size{1, 1, 1, 4, 3}, Size{2, 7, 9, 5, 6}, Size{2, 6, 8, 3, 17}, Size{1, 2, 5, 16, 16},
-                               Size{3, 3, 4, 19, 33}, Size{1, 5, 1, 1, 1}}) {
-        if (unit == 1 && (size.H < kernel.k - 2 * kernel.padding || size.W < kernel.k - 2 * kernel.padding)) continue;
-        check(kernel, {size.B, size.H * unit, size.W * unit, size.Cin, size.Cout}, {.bias = true}, ctx);
+      for (const Size& size : {Size{1, 1, 1, 4, 3}, Size{2, 7, 9, 5, 6}, Size{2, 6, 8, 3, 17},
+                               Size{1, 2, 5, 16, 16}, Size{3, 3, 4, 19, 33}, Size{1, 5, 1, 1, 1}}) {
+        if (unit == 1 &&
+            (size.H < kernel.k - 2 * kernel.padding || size.W < kernel.k - 2 * kernel.padding))
+          continue;
+        check(kernel, {size.B, size.H * unit, size.W * unit, size.Cin, size.Cout}, {.bias = true},
+              ctx);
       }
     }
   });
@@ -79,8 +85,10 @@ TEST_CASE("conv2d_forward: every combination of bias, activation, gamma and resi
   Context ctx(1);
   for_each_target([&] {
     for (int mask = 0; mask < 8; ++mask)
-      for (const Activation activation : {Activation::kNone, Activation::kRelu, Activation::kGelu, Activation::kSigmoid})
-        check({3, 1, 1}, {1, 4, 5, 6, 21}, {(mask & 1) != 0, activation, (mask & 2) != 0, (mask & 4) != 0}, ctx);
+      for (const Activation activation :
+           {Activation::kNone, Activation::kRelu, Activation::kGelu, Activation::kSigmoid})
+        check({3, 1, 1}, {1, 4, 5, 6, 21},
+              {(mask & 1) != 0, activation, (mask & 2) != 0, (mask & 4) != 0}, ctx);
   });
 }
 
@@ -122,10 +130,12 @@ TEST_CASE("conv2d_forward: 1 and 8 threads give the same bits") {
   Context one(1), eight(8);
   const auto x = random_tensor(Shape{2, 23, 31, 20}, 1);
   for (const Kernel& kernel : {Kernel{3, 1, 1}, Kernel{3, 2, 1}, Kernel{1, 1, 0}}) {
-    const PackedConv2d w = pack_conv2d(random_tensor(Shape{std::int64_t{37}, std::int64_t{20}, kernel.k, kernel.k}, 2),
-                                       kernel.stride, kernel.padding);
-    Tensor<float, 4> y1(Shape{std::int64_t{2}, conv2d_extent(23, kernel.k, kernel.stride, kernel.padding),
-                              conv2d_extent(31, kernel.k, kernel.stride, kernel.padding), std::int64_t{37}});
+    const PackedConv2d w =
+        pack_conv2d(random_tensor(Shape{std::int64_t{37}, std::int64_t{20}, kernel.k, kernel.k}, 2),
+                    kernel.stride, kernel.padding);
+    Tensor<float, 4> y1(
+        Shape{std::int64_t{2}, conv2d_extent(23, kernel.k, kernel.stride, kernel.padding),
+              conv2d_extent(31, kernel.k, kernel.stride, kernel.padding), std::int64_t{37}});
     Tensor<float, 4> y8(y1.shape());
     conv2d_forward(y1, x, w, {}, one);
     conv2d_forward(y8, x, w, {}, eight);
@@ -136,9 +146,13 @@ TEST_CASE("conv2d_forward: 1 and 8 threads give the same bits") {
 TEST_CASE("conv2d_forward: shapes that do not fit are refused by name") {
   Context ctx(1);
   const PackedConv2d w = pack_conv2d(Tensor<float, 4>(Shape{5, 3, 3, 3}), 1, 1);
-  Tensor<float, 4> x(Shape{1, 6, 7, 3}), y(Shape{1, 6, 7, 5}), narrow(Shape{1, 6, 6, 5}), channels(Shape{1, 6, 7, 4});
-  CHECK_THROWS_WITH_AS(conv2d_forward(narrow, x, w, {}, ctx), doctest::Contains("[1,6,6,5]"), Error);
-  CHECK_THROWS_WITH_AS(conv2d_forward(y, channels, w, {}, ctx), doctest::Contains("[1,6,7,4]"), Error);
-  CHECK_THROWS_WITH_AS(conv2d_forward(y, x, w, {.residual = narrow}, ctx), doctest::Contains("[1,6,6,5]"), Error);
+  Tensor<float, 4> x(Shape{1, 6, 7, 3}), y(Shape{1, 6, 7, 5}), narrow(Shape{1, 6, 6, 5}),
+      channels(Shape{1, 6, 7, 4});
+  CHECK_THROWS_WITH_AS(conv2d_forward(narrow, x, w, {}, ctx), doctest::Contains("[1,6,6,5]"),
+                       Error);
+  CHECK_THROWS_WITH_AS(conv2d_forward(y, channels, w, {}, ctx), doctest::Contains("[1,6,7,4]"),
+                       Error);
+  CHECK_THROWS_WITH_AS(conv2d_forward(y, x, w, {.residual = narrow}, ctx),
+                       doctest::Contains("[1,6,6,5]"), Error);
   CHECK_THROWS_AS(pack_conv2d(Tensor<float, 4>(Shape{5, 3, 3, 2}), 1, 1), Error);
 }

@@ -18,7 +18,8 @@ TEST_CASE("add: one rounding, every length, strided, y may be a or b") {
   for_each_target([&] {
     for (std::int64_t C = 0; C <= 33; ++C) {
       CAPTURE(C);
-      const auto a = random_tensor(Shape{std::int64_t{3}, C}, 1), b = random_tensor(Shape{std::int64_t{3}, C}, 2);
+      const auto a = random_tensor(Shape{std::int64_t{3}, C}, 1),
+                 b = random_tensor(Shape{std::int64_t{3}, C}, 2);
       Tensor<float, 2> expected(a.shape());
       for (std::int64_t i = 0; i < a.size(); ++i) expected.data()[i] = a.data()[i] + b.data()[i];
       Strided<2> y(a.shape()), sa(a.view()), sb(b.view());
@@ -40,12 +41,15 @@ TEST_CASE("modulate: gate (x (1 + scale) + shift) + t, every length, strided, y 
     for (std::int64_t C = 0; C <= 33; ++C) {
       CAPTURE(C);
       const Shape shape{std::int64_t{2}, C};
-      const auto x = random_tensor(shape, 1), shift = random_tensor(shape, 2), scale = random_tensor(shape, 3);
+      const auto x = random_tensor(shape, 1), shift = random_tensor(shape, 2),
+                 scale = random_tensor(shape, 3);
       const auto gate = random_tensor(shape, 4), t = random_tensor(shape, 5);
       Tensor<double, 2> expected(shape);
       for (std::int64_t i = 0; i < x.size(); ++i)
-        expected.data()[i] = double{gate.data()[i]} * (double{x.data()[i]} * (1 + double{scale.data()[i]}) +
-                                                       double{shift.data()[i]}) + double{t.data()[i]};
+        expected.data()[i] =
+            double{gate.data()[i]} *
+                (double{x.data()[i]} * (1 + double{scale.data()[i]}) + double{shift.data()[i]}) +
+            double{t.data()[i]};
       Strided<2> y(shape), sx(x.view()), st(t.view());
       modulate(y.view(), sx.view(), shift, scale, gate, st.view(), ctx);
       // All below 1 in size: sums below 2, 3 and 4, at most five roundings.
@@ -72,8 +76,8 @@ TEST_CASE("copy_rows: every element, nothing between the rows") {
 
 TEST_CASE("to_planes, from_planes: channels move, and back again; strided pixels") {
   Context ctx(2);
-  for (const Shape<3>& shape : {Shape<3>{{1, 1, 1}}, Shape<3>{{3, 5, 3}}, Shape<3>{{7, 65, 19}}, Shape<3>{{4, 130, 2}},
-                                Shape<3>{{0, 4, 3}}, Shape<3>{{4, 4, 0}}}) {
+  for (const Shape<3>& shape : {Shape<3>{{1, 1, 1}}, Shape<3>{{3, 5, 3}}, Shape<3>{{7, 65, 19}},
+                                Shape<3>{{4, 130, 2}}, Shape<3>{{0, 4, 3}}, Shape<3>{{4, 4, 0}}}) {
     CAPTURE(shape);
     const auto x = random_tensor(shape, 1);
     Strided<3> pixels(x.view()), back(shape);

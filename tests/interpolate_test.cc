@@ -3,6 +3,7 @@
 
 #include <doctest/doctest.h>
 
+#include "tests/reference/bicubic.h"
 #include "tests/reference/interpolate.h"
 #include "tests/support/compare.h"
 #include "tests/support/random.h"
@@ -17,18 +18,23 @@ namespace {
 struct Resize {
   std::int64_t H, W, Ho, Wo;
 };
-constexpr Resize kResizes[] = {{1, 1, 1, 1}, {1, 1, 4, 3}, {3, 5, 1, 4}, {1, 3, 4, 6},  {5, 7, 11, 13},
-                               {4, 5, 8, 10}, {11, 13, 5, 7}, {4, 6, 4, 6}, {2, 9, 9, 2}, {8, 8, 1, 1}};
+constexpr Resize kResizes[] = {{1, 1, 1, 1},   {1, 1, 4, 3},  {3, 5, 1, 4},   {1, 3, 4, 6},
+                               {5, 7, 11, 13}, {4, 5, 8, 10}, {11, 13, 5, 7}, {4, 6, 4, 6},
+                               {2, 9, 9, 2},   {8, 8, 1, 1}};
 
-Tensor<double, 3> bilinear(const Tensor<double, 3>& x, std::int64_t Ho, std::int64_t Wo, bool align_corners) {
-  return reference::resize(x, Ho, Wo, [=](std::int64_t i, std::int64_t j, std::int64_t out, std::int64_t in) {
-    return reference::bilinear_weight<double>(i, j, out, in, align_corners);
-  });
+Tensor<double, 3> bilinear(const Tensor<double, 3>& x, std::int64_t Ho, std::int64_t Wo,
+                           bool align_corners) {
+  return reference::resize(
+      x, Ho, Wo, [=](std::int64_t i, std::int64_t j, std::int64_t out, std::int64_t in) {
+        return reference::bilinear_weight<double>(i, j, out, in, align_corners);
+      });
 }
 
 }  // namespace
 
-TEST_CASE("bilinear_forward: agrees with the definition for both conventions, any size and channel count") {
+TEST_CASE(
+    "bilinear_forward: agrees with the definition for both conventions, any size and channel "
+    "count") {
   Context ctx(2);
   for_each_target([&] {
     for (const Resize& r : kResizes) {
@@ -39,8 +45,10 @@ TEST_CASE("bilinear_forward: agrees with the definition for both conventions, an
           Strided<4> sx(x.view()), y(Shape{std::int64_t{2}, r.Ho, r.Wo, C});
           bilinear_forward(y.view(), sx.view(), align_corners, ctx);
           for (std::int64_t b = 0; b < 2; ++b) {
-            // |x| < 1: each blend rounds the weight, its complement, two products and a sum; two in a row.
-            CHECK_CLOSE(y.view()[b], bilinear(converted<double>(x[b]), r.Ho, r.Wo, align_corners), 10 * kUnit);
+            // |x| < 1: each blend rounds the weight, its complement, two products and a sum; two in
+            // a row.
+            CHECK_CLOSE(y.view()[b], bilinear(converted<double>(x[b]), r.Ho, r.Wo, align_corners),
+                        10 * kUnit);
           }
           CHECK(y.gaps_untouched());
         }
@@ -98,7 +106,8 @@ TEST_CASE("bicubic_antialias_forward: agrees with the definition, shrinking, enl
         Strided<3> sx(x.view()), y(Shape{r.Ho, r.Wo, C});
         bicubic_antialias_forward(y.view(), sx.view(), ctx);
         // At most 4 * 8 + 2 taps a side whose absolute weights add up to less than 1.5 a pass.
-        CHECK_CLOSE(y.view(), reference::resize(in_double(x), r.Ho, r.Wo, reference::bicubic_weight<double>),
+        CHECK_CLOSE(y.view(),
+                    reference::resize(in_double(x), r.Ho, r.Wo, reference::bicubic_weight<double>),
                     2 * 34 * 1.5 * 1.5 * kUnit);
         CHECK(y.gaps_untouched());
       }
@@ -108,15 +117,19 @@ TEST_CASE("bicubic_antialias_forward: agrees with the definition, shrinking, enl
 
 TEST_CASE("interpolate: no output, or an empty input, and mismatched channels") {
   Context ctx(1);
-  Tensor<float, 4> none(Shape{0, 4, 4, 3}), some(Shape{1, 4, 4, 3}), empty(Shape{1, 0, 4, 3}), two(Shape{1, 4, 4, 2});
+  Tensor<float, 4> none(Shape{0, 4, 4, 3}), some(Shape{1, 4, 4, 3}), empty(Shape{1, 0, 4, 3}),
+      two(Shape{1, 4, 4, 2});
   bilinear_forward(none, none, true, ctx);
   bilinear_forward(empty, some, true, ctx);
-  CHECK_THROWS_WITH_AS(bilinear_forward(some, empty, true, ctx), doctest::Contains("[1,0,4,3]"), Error);
+  CHECK_THROWS_WITH_AS(bilinear_forward(some, empty, true, ctx), doctest::Contains("[1,0,4,3]"),
+                       Error);
   CHECK_THROWS_WITH_AS(bilinear_forward(some, two, true, ctx),
                        "bilinear: y is [1,4,4,3] but x is [1,4,4,2]", Error);
   bicubic_antialias_forward(empty[0], some[0], ctx);
-  CHECK_THROWS_WITH_AS(bicubic_antialias_forward(some[0], empty[0], ctx), doctest::Contains("[0,4,3]"), Error);
-  CHECK_THROWS_WITH_AS(bicubic_antialias_forward(some[0], two[0], ctx), doctest::Contains("[4,4,2]"), Error);
+  CHECK_THROWS_WITH_AS(bicubic_antialias_forward(some[0], empty[0], ctx),
+                       doctest::Contains("[0,4,3]"), Error);
+  CHECK_THROWS_WITH_AS(bicubic_antialias_forward(some[0], two[0], ctx),
+                       doctest::Contains("[4,4,2]"), Error);
 }
 
 TEST_CASE("interpolate: 1 and 8 threads give the same bits") {

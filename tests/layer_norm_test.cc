@@ -21,10 +21,11 @@ struct Expected {
   Tensor<double, 2> limit;  // times u
 };
 
-// In units of u = 2^-24: the mean of C values of size M is off by at most (C/4 + 2) M / C per partial sum of
-// at least 4 lanes, less than (C/4 + 2) max|x|; so is every deviation, divided by the standard deviation s.
-// The variance adds (C/4 + 6)/2 relative, the affine part 2.
-Expected expected_of(View<const float, 2> x, View<const float, 1> gamma, View<const float, 1> beta, double eps) {
+// In units of u = 2^-24: the mean of C values of size M is off by at most (C/4 + 2) M / C per
+// partial sum of at least 4 lanes, less than (C/4 + 2) max|x|; so is every deviation, divided by
+// the standard deviation s. The variance adds (C/4 + 6)/2 relative, the affine part 2.
+Expected expected_of(View<const float, 2> x, View<const float, 1> gamma, View<const float, 1> beta,
+                     double eps) {
   const Tensor<double, 2> wide = converted<double>(x);
   Expected expected{reference::layer_norm(wide, eps), Tensor<double, 2>(x.shape())};
   const auto [N, C] = x.shape();
@@ -41,10 +42,10 @@ Expected expected_of(View<const float, 2> x, View<const float, 1> gamma, View<co
       double& y = expected.y(n, c);
       if (gamma) y *= gamma[c];
       if (beta) y += beta[c];
-      expected.limit(n, c) = (gamma ? std::abs(gamma[c]) : 1.0) *
-                                 (steps * largest / std::sqrt(variance + eps) +
-                                  (steps / 2 + 6) * std::abs(normed)) +
-                             2 * std::abs(y);
+      expected.limit(n, c) =
+          (gamma ? std::abs(gamma[c]) : 1.0) *
+              (steps * largest / std::sqrt(variance + eps) + (steps / 2 + 6) * std::abs(normed)) +
+          2 * std::abs(y);
     }
   }
   return expected;
@@ -101,7 +102,8 @@ TEST_CASE("layer_norm_forward: a large common offset does not drown the variance
   });
 }
 
-TEST_CASE("layer_norm_forward: eps decides where the variance is small, and constant rows give beta") {
+TEST_CASE(
+    "layer_norm_forward: eps decides where the variance is small, and constant rows give beta") {
   Context ctx(1);
   for_each_target([&] {
     const auto x = random_tensor(Shape{2, 96}, 1, -1e-3f, 1e-3f);
@@ -146,6 +148,8 @@ TEST_CASE("layer_norm_forward: wrong shapes are refused, both are named") {
   Context ctx(1);
   Tensor<float, 2> x(Shape{2, 8}), y(Shape{2, 9});
   const Tensor<float, 1> gamma(Shape{9});
-  CHECK_THROWS_WITH_AS(layer_norm_forward(y, x, {}, {}, 1e-5f, ctx), doctest::Contains("[2,1,9]"), Error);
-  CHECK_THROWS_WITH_AS(layer_norm_forward(x, x, gamma, {}, 1e-5f, ctx), doctest::Contains("[9]"), Error);
+  CHECK_THROWS_WITH_AS(layer_norm_forward(y, x, {}, {}, 1e-5f, ctx), doctest::Contains("[2,1,9]"),
+                       Error);
+  CHECK_THROWS_WITH_AS(layer_norm_forward(x, x, gamma, {}, 1e-5f, ctx), doctest::Contains("[9]"),
+                       Error);
 }

@@ -24,11 +24,13 @@ void check(const Case& size, const ProductParts& parts, Context& ctx) {
   CAPTURE(size.M);
   CAPTURE(size.N);
   CAPTURE(size.K);
-  const auto x = random_tensor(Shape{size.M, size.K}, 1), w = random_tensor(Shape{size.N, size.K}, 2);
+  const auto x = random_tensor(Shape{size.M, size.K}, 1),
+             w = random_tensor(Shape{size.N, size.K}, 2);
   const ProductOperands operands(parts, size.N);
   const auto residual = random_tensor(Shape{size.M, size.N}, 5);
-  const auto expected = expected_product(reference::linear(in_double(x), in_double(w)),
-                                         reference::linear(magnitudes(x), magnitudes(w)), size.K, operands, residual);
+  const auto expected =
+      expected_product(reference::linear(in_double(x), in_double(w)),
+                       reference::linear(magnitudes(x), magnitudes(w)), size.K, operands, residual);
   Strided<2> sx(x.view()), y(residual.view());
   Epilogue<2> epilogue = operands.epilogue<2>();
   if (parts.residual) epilogue.residual = y.view();  // y may be the residual
@@ -52,7 +54,8 @@ TEST_CASE("linear_forward: agrees with the definition for odd sizes, below a vec
 TEST_CASE("linear_forward: sizes that cross every block, as in the model") {
   Context ctx(2);
   for_each_target([&] {
-    for (const Case& size : {Case{130, 70, 300}, Case{97, 192, 65}, Case{11, 130, 1100}, Case{260, 33, 48}})
+    for (const Case& size :
+         {Case{130, 70, 300}, Case{97, 192, 65}, Case{11, 130, 1100}, Case{260, 33, 48}})
       check(size, {.bias = true}, ctx);
   });
 }
@@ -118,7 +121,10 @@ TEST_CASE("linear_forward: shapes that do not fit are refused by name") {
   const Tensor<float, 1> vector(Shape{5});
   CHECK_THROWS_WITH_AS(linear_forward(y, wrong, w, {}, ctx), doctest::Contains("[3,5]"), Error);
   CHECK_THROWS_WITH_AS(linear_forward(wrong, x, w, {}, ctx), doctest::Contains("[3,5]"), Error);
-  CHECK_THROWS_WITH_AS(linear_forward(y, x, w, {.bias = vector}, ctx), doctest::Contains("[5]"), Error);
-  CHECK_THROWS_WITH_AS(linear_forward(y, x, w, {.gamma = vector}, ctx), doctest::Contains("[5]"), Error);
-  CHECK_THROWS_WITH_AS(linear_forward(y, x, w, {.residual = wrong}, ctx), doctest::Contains("[3,5]"), Error);
+  CHECK_THROWS_WITH_AS(linear_forward(y, x, w, {.bias = vector}, ctx), doctest::Contains("[5]"),
+                       Error);
+  CHECK_THROWS_WITH_AS(linear_forward(y, x, w, {.gamma = vector}, ctx), doctest::Contains("[5]"),
+                       Error);
+  CHECK_THROWS_WITH_AS(linear_forward(y, x, w, {.residual = wrong}, ctx),
+                       doctest::Contains("[3,5]"), Error);
 }

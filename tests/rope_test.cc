@@ -56,8 +56,8 @@ TEST_CASE("make_rope_table: cosines and sines are rounded once, also far from th
   const RopeTable table = make_rope_table(positions, 64, 100);
   for (std::int64_t axis = 0; axis < 2; ++axis)
     for (std::int64_t j = 0; j < 16; ++j) {
-      const double angle =
-          static_cast<double>(positions(0, axis)) * std::pow(100.0, -2.0 * static_cast<double>(j) / 32.0);
+      const double angle = static_cast<double>(positions(0, axis)) *
+                           std::pow(100.0, -2.0 * static_cast<double>(j) / 32.0);
       CHECK(table.cos(0, axis * 16 + j) == static_cast<float>(std::cos(angle)));
       CHECK(table.sin(0, axis * 16 + j) == static_cast<float>(std::sin(angle)));
     }
@@ -90,5 +90,6 @@ TEST_CASE("rope_2d: wrong shapes are refused by name") {
   const auto table = make_rope_table(positions, 8, 100);
   Tensor<float, 3> x(Shape{3, 1, 16}), part(Shape{4, 1, 8});
   CHECK_THROWS_WITH_AS(rope_2d_forward(x, x, table, ctx), doctest::Contains("[3,1,16]"), Error);
-  CHECK_THROWS_WITH_AS(rope_2d_forward(part, part, table, ctx), doctest::Contains("4 tokens"), Error);
+  CHECK_THROWS_WITH_AS(rope_2d_forward(part, part, table, ctx), doctest::Contains("4 tokens"),
+                       Error);
 }

@@ -10,7 +10,8 @@
 
 using namespace lvggt;
 
-TEST_CASE("simd_target: the best of the supported instruction sets, and it can be narrowed for a test") {
+TEST_CASE(
+    "simd_target: the best of the supported instruction sets, and it can be narrowed for a test") {
   const std::vector<std::string> all = simd_targets();
   REQUIRE_FALSE(all.empty());
   CHECK(simd_target() == all.front());

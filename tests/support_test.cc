@@ -77,7 +77,8 @@ TEST_CASE("compare_bits: one unit in the last place and the sign of zero are see
   const Tensor<float, 2> zero = two_by_three(0.0f);
   CHECK(compare_bits(zero.view(), two_by_three(0.0f).view()).ok);
   CHECK_FALSE(compare_bits(zero.view(), two_by_three(-0.0f).view()).ok);
-  CHECK_FALSE(compare_bits(two_by_three(1.0f).view(), two_by_three(std::nextafter(1.0f, 2.0f)).view()).ok);
+  CHECK_FALSE(
+      compare_bits(two_by_three(1.0f).view(), two_by_three(std::nextafter(1.0f, 2.0f)).view()).ok);
 }
 
 TEST_CASE("Strided: keeps the values, has gaps, and sees a write into one") {

@@ -11,7 +11,8 @@ namespace lvggt::reference {
 
 // softmax(scale q k^T) v.   q: [Nq, heads, D]   k, v: [Nk, heads, D]
 template <class T>
-Tensor<T, 3> attention(const Tensor<T, 3>& q, const Tensor<T, 3>& k, const Tensor<T, 3>& v, T scale) {
+Tensor<T, 3> attention(const Tensor<T, 3>& q, const Tensor<T, 3>& k, const Tensor<T, 3>& v,
+                       T scale) {
   Tensor<T, 3> y(q.shape());
   std::vector<T> p(static_cast<std::size_t>(k.extent(0)));
   for (std::int64_t i = 0; i < q.extent(0); ++i)

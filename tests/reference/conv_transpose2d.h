@@ -5,7 +5,8 @@
 
 namespace lvggt::reference {
 
-// Stride = kernel, without bias.   x: [B, H, W, Cin]   w: [Cin, Cout, k, k]   returns [B, kH, kW, Cout]
+// Stride = kernel, without bias.   x: [B, H, W, Cin]   w: [Cin, Cout, k, k]   returns [B, kH, kW,
+// Cout]
 template <class T>
 Tensor<T, 4> conv_transpose2d(const Tensor<T, 4>& x, const Tensor<T, 4>& w) {
   const auto [B, H, W, Cin] = x.shape();

@@ -8,26 +8,16 @@
 
 namespace lvggt::reference {
 
-// One output sample of a resize of `in` to `out` samples: the sum over j of weight(i, j) times input j.
+// One output sample of a resize of `in` to `out` samples: the sum over j of weight(i, j) times
+// input j.
 template <class T>
-T bilinear_weight(std::int64_t i, std::int64_t j, std::int64_t out, std::int64_t in, bool align_corners) {
+T bilinear_weight(std::int64_t i, std::int64_t j, std::int64_t out, std::int64_t in,
+                  bool align_corners) {
   const T source = !align_corners ? (T(i) + T(0.5)) * T(in) / T(out) - T(0.5)
                    : out > 1      ? T(i) * T(in - 1) / T(out - 1)
                                   : T(0);
   return std::max(T(0), 1 - std::abs(std::clamp(source, T(0), T(in - 1)) - T(j)));
 }
-template <class T>
-T bicubic_weight(std::int64_t i, std::int64_t j, std::int64_t out, std::int64_t in) {
-  const T scale = T(in) / T(out), stretch = std::max(scale, T(1));
-  const auto cubic = [](T t) {
-    return t < 1 ? 1.5 * t * t * t - 2.5 * t * t + 1 : t < 2 ? -0.5 * t * t * t + 2.5 * t * t - 4 * t + 2 : 0;
-  };
-  const auto at = [&](std::int64_t k) { return cubic(std::abs(T(k) + T(0.5) - scale * (T(i) + T(0.5))) / stretch); };
-  T total = 0;
-  for (std::int64_t k = 0; k < in; ++k) total += at(k);
-  return at(j) / total;
-}
-
 // x: [H, W, C] to [Ho, Wo, C]; weight(i, j, out, in) as above.
 template <class T, class Weight>
 Tensor<T, 3> resize(const Tensor<T, 3>& x, std::int64_t Ho, std::int64_t Wo, const Weight& weight) {

@@ -21,7 +21,8 @@ Tensor<T, 3> rope_2d(const Tensor<T, 3>& x, const Tensor<std::int64_t, 2>& posit
           const T angle = T(positions(n % positions.extent(0), axis)) * frequency;
           const std::int64_t k = axis * half + j;
           y(n, h, k) = x(n, h, k) * std::cos(angle) - x(n, h, k + quarter) * std::sin(angle);
-          y(n, h, k + quarter) = x(n, h, k + quarter) * std::cos(angle) + x(n, h, k) * std::sin(angle);
+          y(n, h, k + quarter) =
+              x(n, h, k + quarter) * std::cos(angle) + x(n, h, k) * std::sin(angle);
         }
   return y;
 }

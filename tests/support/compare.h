@@ -41,7 +41,8 @@ T& element(View<T, R> x, const Shape<R>& index) {
 }
 
 // Fails unless the shapes agree and |actual - expected| <= limit(index, expected) everywhere. Equal
-// values, infinities too, agree; a NaN on either side fails, and so does a difference with a NaN limit.
+// values, infinities too, agree; a NaN on either side fails, and so does a difference with a NaN
+// limit.
 template <class A, class E, int R, class Limit>
 Comparison compare_by(View<A, R> actual, View<E, R> expected, const Limit& limit) {
   if (actual.shape() != expected.shape())
@@ -70,9 +71,8 @@ Comparison compare_by(View<A, R> actual, View<E, R> expected, const Limit& limit
 // limit = absolute + relative * |expected|
 template <class A, class E, int R>
 Comparison compare(View<A, R> actual, View<E, R> expected, double absolute, double relative = 0) {
-  return compare_by(actual, expected, [=](const Shape<R>&, double e) {
-    return absolute + relative * std::abs(e);
-  });
+  return compare_by(actual, expected,
+                    [=](const Shape<R>&, double e) { return absolute + relative * std::abs(e); });
 }
 
 // One limit an element: factor * limits, for bounds that follow from the norms of the operands.
@@ -111,17 +111,18 @@ View<const T, R> as_view(const Tensor<T, R>& x) {
 
 }  // namespace lvggt::test
 
-// CHECK_CLOSE(actual, expected, absolute [, relative]) and CHECK_CLOSE(actual, expected, factor, limits)
-#define CHECK_CLOSE(actual, expected, ...)                                                       \
-  do {                                                                                           \
-    const ::lvggt::test::Comparison comparison_ = ::lvggt::test::compare(                        \
-        ::lvggt::test::as_view(actual), ::lvggt::test::as_view(expected), __VA_ARGS__);          \
-    CHECK_MESSAGE(comparison_.ok, #actual ": ", comparison_.message);                            \
+// CHECK_CLOSE(actual, expected, absolute [, relative]) and CHECK_CLOSE(actual, expected, factor,
+// limits)
+#define CHECK_CLOSE(actual, expected, ...)                                              \
+  do {                                                                                  \
+    const ::lvggt::test::Comparison comparison_ = ::lvggt::test::compare(               \
+        ::lvggt::test::as_view(actual), ::lvggt::test::as_view(expected), __VA_ARGS__); \
+    CHECK_MESSAGE(comparison_.ok, #actual ": ", comparison_.message);                   \
   } while (false)
 
-#define CHECK_SAME_BITS(actual, expected)                                                 \
-  do {                                                                                    \
-    const ::lvggt::test::Comparison comparison_ = ::lvggt::test::compare_bits(            \
-        ::lvggt::test::as_view(actual), ::lvggt::test::as_view(expected));                \
-    CHECK_MESSAGE(comparison_.ok, #actual ": ", comparison_.message);                     \
+#define CHECK_SAME_BITS(actual, expected)                                      \
+  do {                                                                         \
+    const ::lvggt::test::Comparison comparison_ = ::lvggt::test::compare_bits( \
+        ::lvggt::test::as_view(actual), ::lvggt::test::as_view(expected));     \
+    CHECK_MESSAGE(comparison_.ok, #actual ": ", comparison_.message);          \
   } while (false)

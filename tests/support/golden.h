@@ -15,23 +15,28 @@ inline Safetensors open_golden(const std::string& name) {
   return Safetensors::open(std::string(LVGGT_TEST_DATA) + "/golden/" + name);
 }
 
-// Swaps two axes into a dense copy with a new shape: axis order given as the source axis of each new one.
+// Swaps two axes into a dense copy with a new shape: axis order given as the source axis of each
+// new one.
 template <int R>
 Tensor<float, R> permuted(const Tensor<float, R>& x, const std::array<int, R>& order) {
   Shape<R> shape;
-  for (int axis = 0; axis < R; ++axis) shape[axis] = x.extent(order[static_cast<std::size_t>(axis)]);
+  for (int axis = 0; axis < R; ++axis)
+    shape[axis] = x.extent(order[static_cast<std::size_t>(axis)]);
   Tensor<float, R> y(shape);
   for (std::int64_t n = 0; n < y.size(); ++n) {
     const Shape<R> index = unflatten(n, shape);
     Shape<R> source;
-    for (int axis = 0; axis < R; ++axis) source[order[static_cast<std::size_t>(axis)]] = index[axis];
+    for (int axis = 0; axis < R; ++axis)
+      source[order[static_cast<std::size_t>(axis)]] = index[axis];
     y.data()[n] = element(x.view(), source);
   }
   return y;
 }
 
 // [B, C, H, W] as [B, H, W, C]
-inline Tensor<float, 4> channels_last(const Tensor<float, 4>& x) { return permuted<4>(x, {0, 2, 3, 1}); }
+inline Tensor<float, 4> channels_last(const Tensor<float, 4>& x) {
+  return permuted<4>(x, {0, 2, 3, 1});
+}
 
 // [1, heads, N, D] as [N, heads, D]
 inline Tensor<float, 3> tokens_first(const Tensor<float, 4>& x) {

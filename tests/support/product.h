@@ -50,13 +50,16 @@ struct ExpectedProduct {
   Tensor<double, R> limit;
 };
 
-// Applies the epilogue in double. `sum` is the exact product and `sum_of_magnitudes` the product of the operands'
-// magnitudes: a sum of K products in any order is off by at most K u times that, the bias adds a rounding.
-// No activation is steeper than 1.13 (GELU, SiLU 1.1), each is itself good to 1.8e-7 max(1, |y|), and
-// gamma and the residual round once more each. The last axis is the channels'.
+// Applies the epilogue in double. `sum` is the exact product and `sum_of_magnitudes` the product of
+// the operands' magnitudes: a sum of K products in any order is off by at most K u times that, the
+// bias adds a rounding. No activation is steeper than 1.13 (GELU, SiLU 1.1), each is itself good
+// to 1.8e-7 max(1, |y|), and gamma and the residual round once more each. The last axis is the
+// channels'.
 template <int R>
-ExpectedProduct<R> expected_product(Tensor<double, R> sum, const Tensor<double, R>& sum_of_magnitudes, std::int64_t K,
-                                    const ProductOperands& operands, const Tensor<float, R>& residual) {
+ExpectedProduct<R> expected_product(Tensor<double, R> sum,
+                                    const Tensor<double, R>& sum_of_magnitudes, std::int64_t K,
+                                    const ProductOperands& operands,
+                                    const Tensor<float, R>& residual) {
   const ProductParts& parts = operands.parts;
   const std::int64_t N = operands.bias.extent(0);
   ExpectedProduct<R> expected{std::move(sum), Tensor<double, R>(sum_of_magnitudes.shape())};

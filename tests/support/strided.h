@@ -12,8 +12,9 @@
 
 namespace lvggt::test {
 
-// A view with an unaligned start and gaps behind every axis but the last, inside a buffer whose every other
-// element is NaN: reading one spoils the result, writing one is seen by gaps_untouched().
+// A view with an unaligned start and gaps behind every axis but the last, inside a buffer whose
+// every other element is NaN: reading one spoils the result, writing one is seen by
+// gaps_untouched().
 template <int R>
 class Strided {
  public:
@@ -24,7 +25,8 @@ class Strided {
       strides[static_cast<std::size_t>(axis)] = stride;
       stride = stride * shape[axis] + gap;
     }
-    buffer_.assign(static_cast<std::size_t>(offset + stride), std::numeric_limits<float>::quiet_NaN());
+    buffer_.assign(static_cast<std::size_t>(offset + stride),
+                   std::numeric_limits<float>::quiet_NaN());
     view_ = View<float, R>(buffer_.data() + offset, shape, strides);
   }
 
@@ -41,7 +43,8 @@ class Strided {
   bool gaps_untouched() const {
     std::vector<bool> inside(buffer_.size());
     for (std::int64_t n = 0; n < view_.size(); ++n)
-      inside[static_cast<std::size_t>(&element(view_, unflatten(n, view_.shape())) - buffer_.data())] = true;
+      inside[static_cast<std::size_t>(&element(view_, unflatten(n, view_.shape())) -
+                                      buffer_.data())] = true;
     const auto nan = std::bit_cast<std::uint32_t>(std::numeric_limits<float>::quiet_NaN());
     for (std::size_t i = 0; i < buffer_.size(); ++i)
       if (!inside[i] && std::bit_cast<std::uint32_t>(buffer_[i]) != nan) return false;

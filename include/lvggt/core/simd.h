@@ -6,8 +6,8 @@
 
 namespace lvggt {
 
-// Name of the instruction set that the kernels run on: the best one that was compiled and that this CPU has,
-// e.g. "AVX-512", "AVX2", "SSE4", "NEON".
+// Name of the instruction set that the kernels run on: the best one that was compiled and that this
+// CPU has, e.g. "AVX-512", "AVX2", "SSE4", "NEON".
 std::string simd_target();
 
 // All instruction sets that were compiled and that this CPU has, best first.
