@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// The convolutions of the DPT heads and the UNets, and the resize between them, at 294 x 518 pixels.
+// The convolutions of the DPT heads and the UNets, and the resize between them, at 294 x 518
+// pixels.
 #include <cmath>
 
 #include "bench/peak.h"
@@ -14,8 +15,8 @@ using namespace lvggt;
 using namespace lvggt::bench;
 
 // The last output of row 0 by its definition, so that a broken kernel is not timed.
-void verify(View<const float, 4> y, View<const float, 4> x, View<const float, 4> w, std::int64_t stride,
-            std::int64_t padding) {
+void verify(View<const float, 4> y, View<const float, 4> x, View<const float, 4> w,
+            std::int64_t stride, std::int64_t padding) {
   const std::int64_t ox = y.extent(2) - 1, n = y.extent(3) - 1, k = w.extent(2);
   double sum = 0;
   for (std::int64_t ky = 0; ky < k; ++ky) {
@@ -44,9 +45,8 @@ void conv2d_forward(benchmark::State& state) {
   lvggt::conv2d_forward(y, x, w, {}, ctx);
   verify(y, x, weight, stride, padding);
   const double flops = 2.0 * static_cast<double>(y.size() * Cin * kernel * kernel);
-  run_against_peak(state, ctx, flops, [&] {
-    lvggt::conv2d_forward(y, x, w, {.activation = Activation::kRelu}, ctx);
-  });
+  run_against_peak(state, ctx, flops,
+                   [&] { lvggt::conv2d_forward(y, x, w, {.activation = Activation::kRelu}, ctx); });
 }
 
 BENCHMARK(conv2d_forward)
@@ -62,10 +62,12 @@ BENCHMARK(conv2d_forward)
     ->Unit(benchmark::kMillisecond);
 
 void conv_transpose2d_forward(benchmark::State& state) {
-  const std::int64_t kernel = state.range(0), C = state.range(1), H = state.range(2), W = state.range(3);
+  const std::int64_t kernel = state.range(0), C = state.range(1), H = state.range(2),
+                     W = state.range(3);
   Context ctx;
   const auto x = random_tensor(Shape{std::int64_t{1}, H, W, C}, 1);
-  const PackedConvTranspose2d w = pack_conv_transpose2d(random_tensor(Shape{C, C, kernel, kernel}, 2));
+  const PackedConvTranspose2d w =
+      pack_conv_transpose2d(random_tensor(Shape{C, C, kernel, kernel}, 2));
   Tensor<float, 4> y(Shape{std::int64_t{1}, kernel * H, kernel * W, C});
   const double flops = 2.0 * static_cast<double>(y.size() * C);
   run_against_peak(state, ctx, flops, [&] { lvggt::conv_transpose2d_forward(y, x, w, {}, ctx); });
@@ -84,11 +86,17 @@ void bilinear_forward(benchmark::State& state) {
   const auto x = random_tensor(Shape{std::int64_t{1}, H, W, C}, 1);
   Tensor<float, 4> y(Shape{std::int64_t{1}, Ho, Wo, C});
   for (auto _ : state) lvggt::bilinear_forward(y, x, true, ctx);
-  LVGGT_CHECK(y(0, Ho - 1, Wo - 1, 0) == x(0, H - 1, W - 1, 0), "bench_conv: corners are not aligned");
+  LVGGT_CHECK(y(0, Ho - 1, Wo - 1, 0) == x(0, H - 1, W - 1, 0),
+              "bench_conv: corners are not aligned");
   state.SetBytesProcessed(state.iterations() * (x.size() + y.size()) * 4);
 }
 
-BENCHMARK(bilinear_forward)->ArgName("C")->Arg(256)->Arg(128)->UseRealTime()->Unit(benchmark::kMillisecond);
+BENCHMARK(bilinear_forward)
+    ->ArgName("C")
+    ->Arg(256)
+    ->Arg(128)
+    ->UseRealTime()
+    ->Unit(benchmark::kMillisecond);
 
 }  // namespace
 

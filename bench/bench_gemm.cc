@@ -11,14 +11,16 @@ namespace {
 using namespace lvggt;
 using namespace lvggt::bench;
 
-// Two output elements by their definition, to within what the storage rounds, so that a broken kernel is not timed.
+// Two output elements by their definition, to within what the storage rounds, so that a broken
+// kernel is not timed.
 void verify(View<const float, 2> y, View<const float, 2> x, View<const float, 2> w,
             View<const float, 1> bias, double tolerance) {
   for (const std::int64_t m : {std::int64_t{0}, x.extent(0) - 1}) {
     const std::int64_t n = w.extent(0) - 1;
     double sum = bias[n];
     for (std::int64_t k = 0; k < x.extent(1); ++k) sum += static_cast<double>(x(m, k)) * w(n, k);
-    LVGGT_CHECK(std::abs(y(m, n) - sum) < tolerance, "bench_gemm: y is ", y(m, n), " but should be ", sum);
+    LVGGT_CHECK(std::abs(y(m, n) - sum) < tolerance, "bench_gemm: y is ", y(m, n),
+                " but should be ", sum);
   }
 }
 
@@ -51,10 +53,22 @@ void block_shapes(benchmark::internal::Benchmark* b) {
   b->Args({1, 6 * kDim, 2 * kDim, 0});  // the camera head's qkv for one token
 }
 
-BENCHMARK_CAPTURE(linear_forward, f32, Storage::kF32)->Apply(block_shapes)->UseManualTime()->Unit(benchmark::kMillisecond);
-BENCHMARK_CAPTURE(linear_forward, bf16, Storage::kBf16)->Apply(block_shapes)->UseManualTime()->Unit(benchmark::kMillisecond);
-BENCHMARK_CAPTURE(linear_forward, f16, Storage::kF16)->Apply(block_shapes)->UseManualTime()->Unit(benchmark::kMillisecond);
-BENCHMARK_CAPTURE(linear_forward, int8, Storage::kI8)->Apply(block_shapes)->UseManualTime()->Unit(benchmark::kMillisecond);
+BENCHMARK_CAPTURE(linear_forward, f32, Storage::kF32)
+    ->Apply(block_shapes)
+    ->UseManualTime()
+    ->Unit(benchmark::kMillisecond);
+BENCHMARK_CAPTURE(linear_forward, bf16, Storage::kBf16)
+    ->Apply(block_shapes)
+    ->UseManualTime()
+    ->Unit(benchmark::kMillisecond);
+BENCHMARK_CAPTURE(linear_forward, f16, Storage::kF16)
+    ->Apply(block_shapes)
+    ->UseManualTime()
+    ->Unit(benchmark::kMillisecond);
+BENCHMARK_CAPTURE(linear_forward, int8, Storage::kI8)
+    ->Apply(block_shapes)
+    ->UseManualTime()
+    ->Unit(benchmark::kMillisecond);
 
 }  // namespace
 

@@ -15,8 +15,8 @@ namespace {
 
 namespace hn = hwy::HWY_NAMESPACE;
 
-// Twelve independent sums: enough to hide a latency of 4 cycles at 2 or 3 multiply-adds a cycle, few enough for 16
-// registers. Returns the floating-point operations done.
+// Twelve independent sums: enough to hide a latency of 4 cycles at 2 or 3 multiply-adds a cycle,
+// few enough for 16 registers. Returns the floating-point operations done.
 double multiply_add_loop(long iterations, float* sink) {  // sink: [16]
   const hn::ScalableTag<float> d;
   const auto a = hn::Set(d, 0.999999f);
@@ -40,7 +40,8 @@ double multiply_add_loop(long iterations, float* sink) {  // sink: [16]
     s10 = hn::MulAdd(s10, a, b);
     s11 = hn::MulAdd(s11, a, b);
   }
-  s0 = hn::Add(hn::Add(hn::Add(s0, s1), hn::Add(s2, s3)), hn::Add(hn::Add(s4, s5), hn::Add(s6, s7)));
+  s0 =
+      hn::Add(hn::Add(hn::Add(s0, s1), hn::Add(s2, s3)), hn::Add(hn::Add(s4, s5), hn::Add(s6, s7)));
   s0 = hn::Add(s0, hn::Add(hn::Add(s8, s9), hn::Add(s10, s11)));
   *sink = hn::GetLane(s0);
   return 2.0 * 12 * static_cast<double>(hn::Lanes(d)) * static_cast<double>(iterations);
@@ -65,7 +66,8 @@ double peak_flops(Context& ctx) {
     const auto start = std::chrono::steady_clock::now();
     parallel_chunks(
         ctx.num_threads(),
-        [&](std::int64_t chunk, int) { flops(chunk) = loop(kIterations, &sinks(chunk * 16)); }, ctx);
+        [&](std::int64_t chunk, int) { flops(chunk) = loop(kIterations, &sinks(chunk * 16)); },
+        ctx);
     const std::chrono::duration<double> elapsed = std::chrono::steady_clock::now() - start;
     benchmark::DoNotOptimize(sinks.data());
     double total = 0;

@@ -10,8 +10,8 @@
 
 namespace lvggt::bench {
 
-// What all threads of ctx reach together in a loop of multiply-adds that touches registers only, in FLOP/s (2 a
-// multiply-add): the best of several short runs.
+// What all threads of ctx reach together in a loop of multiply-adds that touches registers only, in
+// FLOP/s (2 a multiply-add): the best of several short runs.
 double peak_flops(Context& ctx);
 
 // Calls work() once an iteration and reports
@@ -30,8 +30,8 @@ void run_against_peak(benchmark::State& state, Context& ctx, double flops, const
   }
   const double peak = std::max(before, peak_flops(ctx));
   const double reached = flops * static_cast<double>(state.iterations()) / seconds;
-  state.counters["FLOP/s"] = benchmark::Counter(reached, benchmark::Counter::kDefaults,
-                                                benchmark::Counter::OneK::kIs1000);
+  state.counters["FLOP/s"] =
+      benchmark::Counter(reached, benchmark::Counter::kDefaults, benchmark::Counter::OneK::kIs1000);
   state.counters["%peak"] = 100 * reached / peak;
 }
 

@@ -5,8 +5,8 @@
 
 #include "lvggt/core/tensor.h"
 
-// Sizes of the published configuration: a frame of 294 x 518 pixels is 21 x 37 patches and 5 special tokens, a
-// square one of 518 x 518 is 37 x 37 and 5.
+// Sizes of the published configuration: a frame of 294 x 518 pixels is 21 x 37 patches and 5
+// special tokens, a square one of 518 x 518 is 37 x 37 and 5.
 namespace lvggt::bench {
 
 inline constexpr std::int64_t kTokens = 782;

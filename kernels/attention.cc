@@ -14,29 +14,33 @@
 //
 #include "hwy/highway.h"
 #include "kernels/simd-inl.h"
+#include "kernels/storage-inl.h"
 #include "kernels/tile-inl.h"
 
 #ifndef LVGGT_ATTENTION_ONCE
 #define LVGGT_ATTENTION_ONCE
 namespace lvggt::kernels {
 
-// Queries of one head handled together, and keys scored before the running maximum is updated: at most 15 panels =
-// 240 keys. The keys and values of a block (2 x 240 x 64 floats = 120 KiB), its scores (96 x 240 floats =
-// 90 KiB), the queries and the outputs (24 KiB each) fit a second-level cache of 512 KiB. Each product walks
-// all 96 rows with one group of panels, which stays in the first-level cache: a panel is 4 KiB of keys or
-// 15 KiB of values. 9, 12 and 15 panels measured alike.
+// Queries of one head handled together, and keys scored before the running maximum is updated: at
+// most 15 panels = 240 keys. The keys and values of a block (2 x 240 x 64 floats = 120 KiB), its
+// scores (96 x 240 floats = 90 KiB), the queries and the outputs (24 KiB each) fit a second-level
+// cache of 512 KiB. Each product walks all 96 rows with one group of panels, which stays in the
+// first-level cache: a panel is 4 KiB of keys or 15 KiB of values. 9, 12 and 15 panels measured
+// alike.
 inline constexpr std::int64_t kQueryBlock = 96;  // a multiple of every tile's rows
 inline constexpr std::int64_t kKeyPanels = 15;
 inline constexpr std::int64_t kScorePitch = kKeyPanels * kPanelWidth + 16;
 
 struct AttentionScratch {
-  float* queries = nullptr;     // [kQueryBlock, D], scaled
-  float* outputs = nullptr;     // [kQueryBlock, D rounded up to a panel]
-  float* scores = nullptr;      // [kQueryBlock, kScorePitch]
+  float* queries = nullptr;            // [kQueryBlock, D], scaled
+  float* outputs = nullptr;            // [kQueryBlock, D rounded up to a panel]
+  float* scores = nullptr;             // [kQueryBlock, kScorePitch]
   const float** query_rows = nullptr;  // [kQueryBlock]
   const float** score_rows = nullptr;  // [kQueryBlock]
-  float* maximum = nullptr;     // [kQueryBlock]
-  float* sum = nullptr;         // [kQueryBlock]
+  float* keys = nullptr;               // [kKeyPanels, D, 16]: a block of narrow keys as floats
+  float* values = nullptr;             // [num_panels(D), 16 kKeyPanels, 16]: of narrow values
+  float* maximum = nullptr;            // [kQueryBlock]
+  float* sum = nullptr;                // [kQueryBlock]
 };
 
 }  // namespace lvggt::kernels
@@ -47,8 +51,8 @@ namespace lvggt::kernels::HWY_NAMESPACE {
 namespace {
 
 // 2^x for x <= 0: x = n + f with |f| <= 1/2, 2^f by its Taylor polynomial of degree 6 (remainder
-// (ln 2 / 2)^7 / 7! = 1.2e-7), n added to the exponent. Below -126 the result is 2^-126, which is nothing
-// beside the row's maximum, which counts 1. NaN stays NaN.
+// (ln 2 / 2)^7 / 7! = 1.2e-7), n added to the exponent. Below -126 the result is 2^-126, which is
+// nothing beside the row's maximum, which counts 1. NaN stays NaN.
 HWY_INLINE hn::Vec<Floats> exp2_nonpositive(Floats d, hn::Vec<Floats> x) {
   const hn::RebindToSigned<Floats> di;
   x = hn::IfThenElse(hn::Lt(x, hn::Set(d, -126.0f)), hn::Set(d, -126.0f), x);
@@ -65,17 +69,18 @@ HWY_INLINE hn::Vec<Floats> exp2_nonpositive(Floats d, hn::Vec<Floats> x) {
   return hn::IfThenElse(hn::Eq(x, x), hn::BitCast(d, hn::Add(hn::BitCast(di, p), exponent)), x);
 }
 
-// Turns one row of scores into weights 2^(score - maximum), and brings the row's running maximum, sum and
-// output to the new maximum. `keys` is a multiple of 16.
-HWY_INLINE void softmax_row(float* HWY_RESTRICT scores, std::int64_t keys, float& maximum, float& sum,
-                            float* HWY_RESTRICT output, std::int64_t width) {
+// Turns one row of scores into weights 2^(score - maximum), and brings the row's running maximum,
+// sum and output to the new maximum. `keys` is a multiple of 16.
+HWY_INLINE void softmax_row(float* HWY_RESTRICT scores, std::int64_t keys, float& maximum,
+                            float& sum, float* HWY_RESTRICT output, std::int64_t width) {
   const Floats d;
   auto largest0 = hn::LoadU(d, scores);
   auto largest1 = largest0;
   for (std::int64_t i = 0; i < keys; i += kPanelWidth) {
     for (int v = 0; v < kPanelVectors; v += 2) {
       largest0 = hn::Max(largest0, hn::LoadU(d, scores + i + v * kLanes));
-      if (v + 1 < kPanelVectors) largest1 = hn::Max(largest1, hn::LoadU(d, scores + i + (v + 1) * kLanes));
+      if (v + 1 < kPanelVectors)
+        largest1 = hn::Max(largest1, hn::LoadU(d, scores + i + (v + 1) * kLanes));
     }
   }
   const float largest = hn::GetLane(hn::MaxOfLanes(d, hn::Max(largest0, largest1)));
@@ -105,24 +110,69 @@ HWY_INLINE void softmax_row(float* HWY_RESTRICT scores, std::int64_t keys, float
   sum += hn::GetLane(hn::SumOfLanes(d, sums[0]));
 }
 
+// Panels of keys, D lines each, and of values, whose lines are the block's tokens.
+struct KeyBlock {
+  const float* keys;
+  const float* values;
+  std::int64_t value_stride;  // floats between two panels of values
+};
+
+// Tokens of panels [panel0, panel1) of one head of one group, widened if they are stored narrow.
+KeyBlock key_block(const PackedKeysValues& group, std::int64_t head, std::int64_t panel0,
+                   std::int64_t panel1, const AttentionScratch& s) {
+  const KeysValuesLayout layout =
+      keys_values_layout(group.storage, group.num_heads, group.num_tokens, group.head_dim);
+  const std::int64_t D = group.head_dim, panels = num_panels(group.num_tokens);
+  const std::int64_t padded_tokens = panels * kPanelWidth, feature_panels = num_panels(D);
+  const auto bytes = static_cast<std::int64_t>(storage_bytes(group.storage));
+  const std::byte* keys = group.data + (head * panels + panel0) * D * kPanelWidth * bytes;
+  const std::byte* values =
+      group.data + layout.values +
+      (head * feature_panels * padded_tokens + panel0 * kPanelWidth) * kPanelWidth * bytes;
+  if (group.storage == Storage::kF32) {
+    return {reinterpret_cast<const float*>(keys), reinterpret_cast<const float*>(values),
+            padded_tokens * kPanelWidth};
+  }
+  const std::int64_t num_keys = (panel1 - panel0) * kPanelWidth;
+  const std::int64_t scale0 = head * padded_tokens + panel0 * kPanelWidth;
+  const float* key_scales = reinterpret_cast<const float*>(group.data + layout.key_scales) + scale0;
+  const float* value_scales =
+      reinterpret_cast<const float*>(group.data + layout.value_scales) + scale0;
+  if (group.storage == Storage::kI8) {
+    for (std::int64_t p = 0; p < panel1 - panel0; ++p) {
+      widen_lines_by_lane(reinterpret_cast<const std::int8_t*>(keys) + p * D * kPanelWidth, D,
+                          key_scales + p * kPanelWidth, s.keys + p * D * kPanelWidth);
+    }
+  } else {
+    widen_lines(group.storage, keys, (panel1 - panel0) * D, s.keys);
+  }
+  for (std::int64_t f = 0; f < feature_panels; ++f) {
+    const std::byte* panel = values + f * padded_tokens * kPanelWidth * bytes;
+    float* to = s.values + f * num_keys * kPanelWidth;
+    if (group.storage == Storage::kI8) {
+      widen_lines_by_line(reinterpret_cast<const std::int8_t*>(panel), num_keys, value_scales, to);
+    } else {
+      widen_lines(group.storage, panel, num_keys, to);
+    }
+  }
+  return {s.keys, s.values, num_keys * kPanelWidth};
+}
+
 // Keys [panel0, panel1) of one head of one group against all queries of the block.
-void attend_block(const PackedKeysValues& group, std::int64_t head, std::int64_t panel0, std::int64_t panel1,
-                  std::int64_t num_queries, const AttentionScratch& s) {
+void attend_block(const PackedKeysValues& group, std::int64_t head, std::int64_t panel0,
+                  std::int64_t panel1, std::int64_t num_queries, const AttentionScratch& s) {
   const std::int64_t D = group.head_dim;
-  const std::int64_t panels = num_panels(group.num_tokens);
   const std::int64_t feature_panels = num_panels(D);
-  const std::int64_t padded_tokens = panels * kPanelWidth;
   const std::int64_t width = feature_panels * kPanelWidth;
-  const float* keys = group.keys + (head * panels + panel0) * D * kPanelWidth;
-  const float* values =
-      group.values + head * width * padded_tokens + panel0 * kPanelWidth * kPanelWidth;
   const std::int64_t num_keys = (panel1 - panel0) * kPanelWidth;
   const std::int64_t valid_keys = std::min(num_keys, group.num_tokens - panel0 * kPanelWidth);
+  const KeyBlock block = key_block(group, head, panel0, panel1, s);
 
   for_panel_groups(panel1 - panel0, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
     for (std::int64_t r = 0; r < num_queries; r += kTileRows) {
-      tile_of<false>(count, s.query_rows + r, 0, 1, D, keys + first * D * kPanelWidth, D * kPanelWidth,
-                     s.scores + r * kScorePitch + first * kPanelWidth, kScorePitch);
+      tile_of<false>(count, s.query_rows + r, 0, 1, D, block.keys + first * D * kPanelWidth,
+                     D * kPanelWidth, s.scores + r * kScorePitch + first * kPanelWidth,
+                     kScorePitch);
     }
   });
   for (std::int64_t r = 0; r < num_queries; ++r) {
@@ -132,15 +182,17 @@ void attend_block(const PackedKeysValues& group, std::int64_t head, std::int64_t
   }
   for_panel_groups(feature_panels, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
     for (std::int64_t r = 0; r < num_queries; r += kTileRows) {
-      tile_of<true>(count, s.score_rows + r, 0, 1, num_keys, values + first * padded_tokens * kPanelWidth,
-                    padded_tokens * kPanelWidth, s.outputs + r * width + first * kPanelWidth, width);
+      tile_of<true>(count, s.score_rows + r, 0, 1, num_keys,
+                    block.values + first * block.value_stride, block.value_stride,
+                    s.outputs + r * width + first * kPanelWidth, width);
     }
   });
 }
 
 // Queries [q0, q1) of one head over all groups.
-void attend(View<float, 3> y, View<const float, 3> q, std::span<const PackedKeysValues> past, float scale,
-            std::int64_t head, std::int64_t q0, std::int64_t q1, const AttentionScratch& s) {
+void attend(View<float, 3> y, View<const float, 3> q, std::span<const PackedKeysValues> past,
+            float scale, std::int64_t head, std::int64_t q0, std::int64_t q1,
+            const AttentionScratch& s) {
   const Floats d;
   const std::int64_t D = q.extent(2);
   const std::int64_t width = num_panels(D) * kPanelWidth;
@@ -188,44 +240,16 @@ namespace kernels {
 HWY_EXPORT(attend);
 }  // namespace kernels
 
-void pack_keys_values(PackedKeysValues packed, View<const float, 3> k, View<const float, 3> v,
-                      Context& ctx) {
-  const std::int64_t P = packed.num_tokens, D = packed.head_dim;
-  const Shape expected{P, packed.num_heads, D};
-  LVGGT_CHECK(k.shape() == expected && v.shape() == expected, "pack_keys_values: k is ", k.shape(), " and v is ",
-              v.shape(), " but the packed group is ", expected);
-  const std::int64_t panels = num_panels(P);
-  const std::int64_t padded = panels * kPanelWidth;
-  const std::int64_t feature_panels = num_panels(D);
-  parallel_chunks(
-      packed.num_heads,
-      [&](std::int64_t head, int) {
-        float* keys = packed.keys + head * padded * D;
-        float* values = packed.values + head * feature_panels * kPanelWidth * padded;
-        for (std::int64_t t = 0; t < padded; ++t) {
-          const bool valid = t < P;
-          const float* from_k = valid ? k.data() + t * k.stride(0) + head * k.stride(1) : nullptr;
-          const float* from_v = valid ? v.data() + t * v.stride(0) + head * v.stride(1) : nullptr;
-          float* to_k = keys + t / kPanelWidth * D * kPanelWidth + t % kPanelWidth;
-          for (std::int64_t i = 0; i < D; ++i) to_k[i * kPanelWidth] = valid ? from_k[i] : 0.0f;
-          for (std::int64_t f = 0; f < feature_panels; ++f) {
-            float* to_v = values + (f * padded + t) * kPanelWidth;
-            const std::int64_t n = valid ? std::min(kPanelWidth, D - f * kPanelWidth) : 0;
-            std::copy_n(from_v + (valid ? f * kPanelWidth : 0), n, to_v);
-            std::fill(to_v + n, to_v + kPanelWidth, 0.0f);
-          }
-        }
-      },
-      ctx);
-}
-
 void scaled_dot_product_attention(View<float, 3> y, View<const float, 3> q,
-                                  std::span<const PackedKeysValues> past, float scale, Context& ctx) {
+                                  std::span<const PackedKeysValues> past, float scale,
+                                  Context& ctx) {
   using namespace kernels;
   const auto [Nq, heads, D] = q.shape();
   LVGGT_CHECK(y.shape() == q.shape(), "attention: y is ", y.shape(), " but q is ", q.shape());
   std::int64_t num_keys = 0;
+  bool narrow = false;
   for (const PackedKeysValues& group : past) {
+    narrow = narrow || group.storage != Storage::kF32;
     LVGGT_CHECK(group.num_heads == heads && group.head_dim == D, "attention: q is ", q.shape(),
                 " but the keys have ", group.num_heads, " heads of ", group.head_dim);
     num_keys += group.num_tokens;
@@ -239,6 +263,9 @@ void scaled_dot_product_attention(View<float, 3> y, View<const float, 3> q,
   const auto outputs = ctx.arena().alloc(Shape{workers, kQueryBlock, width});
   const auto scores = ctx.arena().alloc(Shape{workers, kQueryBlock, kScorePitch});
   const auto rows = ctx.arena().alloc<const float*>(Shape{workers, std::int64_t{2}, kQueryBlock});
+  const std::int64_t widened_keys = narrow ? kKeyPanels * kPanelWidth : 0;
+  const auto keys = ctx.arena().alloc(Shape{workers, widened_keys * D});
+  const auto values = ctx.arena().alloc(Shape{workers, widened_keys * width});
   const auto running = ctx.arena().alloc(Shape{workers, std::int64_t{2}, kQueryBlock});
   const auto run = HWY_DYNAMIC_DISPATCH(attend);
   const std::int64_t blocks = (Nq + kQueryBlock - 1) / kQueryBlock;
@@ -248,8 +275,9 @@ void scaled_dot_product_attention(View<float, 3> y, View<const float, 3> q,
       [&](std::int64_t chunk, int worker) {
         const std::int64_t head = chunk / blocks, q0 = chunk % blocks * kQueryBlock;
         run(y, q, past, scale, head, q0, std::min(num_queries, q0 + kQueryBlock),
-            {queries[worker].data(), outputs[worker].data(), scores[worker].data(), rows[worker][0].data(),
-             rows[worker][1].data(), running[worker][0].data(), running[worker][1].data()});
+            {queries[worker].data(), outputs[worker].data(), scores[worker].data(),
+             rows[worker][0].data(), rows[worker][1].data(), keys[worker].data(),
+             values[worker].data(), running[worker][0].data(), running[worker][1].data()});
       },
       ctx);
 }

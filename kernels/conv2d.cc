@@ -11,9 +11,11 @@ namespace lvggt {
 PackedConv2d pack_conv2d(View<const float, 4> weight, std::int64_t stride, std::int64_t padding,
                          Storage storage) {
   const auto [Cout, Cin, kernel, kernel_x] = weight.shape();
-  LVGGT_CHECK(kernel == kernel_x, "conv2d: weight ", weight.shape(), " does not have a square kernel");
+  LVGGT_CHECK(kernel == kernel_x, "conv2d: weight ", weight.shape(),
+              " does not have a square kernel");
   const std::int64_t taps = kernel * kernel;
-  PackedConv2d packed{Cin, kernel, stride, padding, kernels::empty_matrix(Cout, taps, Cin, storage)};
+  PackedConv2d packed{Cin, kernel, stride, padding,
+                      kernels::empty_matrix(Cout, taps, Cin, storage)};
   for (std::int64_t n = 0; n < Cout; ++n) {
     const View<const float, 3> filter = weight[n];
     for (std::int64_t t = 0; t < taps; ++t) {
@@ -31,8 +33,8 @@ namespace {
 class ConvGather {
  public:
   // merged: without padding, the taps of one kernel row lie side by side and are read as one.
-  ConvGather(View<float, 4> y, View<const float, 4> x, View<const float, 4> residual, const PackedConv2d& w,
-             bool merged, const float* zeros)
+  ConvGather(View<float, 4> y, View<const float, 4> x, View<const float, 4> residual,
+             const PackedConv2d& w, bool merged, const float* zeros)
       : y_(y), x_(x), residual_(residual), w_(w), taps_x_(merged ? 1 : w.kernel), zeros_(zeros) {}
 
   void operator()(const kernels::RowTable& table) const {
@@ -43,8 +45,8 @@ class ConvGather {
     for (std::int64_t r = 0; r < table.count; ++r) {
       table.y[r] = y_.data() + b * y_.stride(0) + oy * y_.stride(1) + ox * y_.stride(2);
       if (residual_) {
-        table.residual[r] =
-            residual_.data() + b * residual_.stride(0) + oy * residual_.stride(1) + ox * residual_.stride(2);
+        table.residual[r] = residual_.data() + b * residual_.stride(0) + oy * residual_.stride(1) +
+                            ox * residual_.stride(2);
       }
       for (std::int64_t ky = 0; ky < w_.kernel; ++ky) {
         for (std::int64_t kx = 0; kx < taps_x_; ++kx) {
@@ -82,11 +84,12 @@ void conv2d_forward(View<float, 4> y, View<const float, 4> x, const PackedConv2d
                     const Epilogue<4>& epilogue, Context& ctx) {
   const auto [B, H, W, Cin] = x.shape();
   const std::int64_t Cout = w.matrix.N;
-  LVGGT_CHECK(Cin == w.in_channels, "conv2d: x is ", x.shape(), " but the weight reads ", w.in_channels,
-              " channels");
+  LVGGT_CHECK(Cin == w.in_channels, "conv2d: x is ", x.shape(), " but the weight reads ",
+              w.in_channels, " channels");
   const Shape expected{B, conv2d_extent(H, w.kernel, w.stride, w.padding),
                        conv2d_extent(W, w.kernel, w.stride, w.padding), Cout};
-  LVGGT_CHECK(y.shape() == expected, "conv2d: y is ", y.shape(), " but x ", x.shape(), " gives ", expected);
+  LVGGT_CHECK(y.shape() == expected, "conv2d: y is ", y.shape(), " but x ", x.shape(), " gives ",
+              expected);
   LVGGT_CHECK(epilogue.bias.empty() || epilogue.bias.extent(0) == Cout, "conv2d: bias is ",
               epilogue.bias.shape(), " but y is ", y.shape());
   LVGGT_CHECK(epilogue.gamma.empty() || epilogue.gamma.extent(0) == Cout, "conv2d: gamma is ",

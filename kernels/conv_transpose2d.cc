@@ -15,7 +15,8 @@ PackedConvTranspose2d pack_conv_transpose2d(View<const float, 4> weight, Storage
     for (std::int64_t kx = 0; kx < kernel; ++kx) {
       PackedMatrix place = kernels::empty_matrix(Cout, 1, Cin, storage);
       for (std::int64_t n = 0; n < Cout; ++n) {
-        for (std::int64_t c = 0; c < Cin; ++c) kernels::set_weight(place, n, c, weight(c, n, ky, kx));
+        for (std::int64_t c = 0; c < Cin; ++c)
+          kernels::set_weight(place, n, c, weight(c, n, ky, kx));
       }
       packed.places.push_back(std::move(place));
     }
@@ -24,19 +25,20 @@ PackedConvTranspose2d pack_conv_transpose2d(View<const float, 4> weight, Storage
 }
 
 void conv_transpose2d_forward(View<float, 4> y, View<const float, 4> x,
-                              const PackedConvTranspose2d& w, View<const float, 1> bias, Context& ctx) {
+                              const PackedConvTranspose2d& w, View<const float, 1> bias,
+                              Context& ctx) {
   const std::int64_t B = x.extent(0), H = x.extent(1), W = x.extent(2), k = w.kernel;
-  LVGGT_CHECK(x.extent(3) == w.in_channels, "conv_transpose2d: x is ", x.shape(), " but the weight reads ",
-              w.in_channels, " channels");
+  LVGGT_CHECK(x.extent(3) == w.in_channels, "conv_transpose2d: x is ", x.shape(),
+              " but the weight reads ", w.in_channels, " channels");
   const Shape expected{B, k * H, k * W, w.out_channels};
-  LVGGT_CHECK(y.shape() == expected, "conv_transpose2d: y is ", y.shape(), " but x ", x.shape(), " gives ",
-              expected);
-  LVGGT_CHECK(bias.empty() || bias.extent(0) == w.out_channels, "conv_transpose2d: bias is ", bias.shape(),
-              " but y is ", y.shape());
+  LVGGT_CHECK(y.shape() == expected, "conv_transpose2d: y is ", y.shape(), " but x ", x.shape(),
+              " gives ", expected);
+  LVGGT_CHECK(bias.empty() || bias.extent(0) == w.out_channels, "conv_transpose2d: bias is ",
+              bias.shape(), " but y is ", y.shape());
   for (std::int64_t ky = 0; ky < k; ++ky) {
     for (std::int64_t kx = 0; kx < k; ++kx) {
       const PackedMatrix& place = w.places[static_cast<std::size_t>(ky * k + kx)];
-      const kernels::Product product{B * H * W, &place, 1, w.in_channels, bias.data(),
+      const kernels::Product product{B * H * W,         &place,  1,    w.in_channels, bias.data(),
                                      Activation::kNone, nullptr, false};
       kernels::run_product(
           product,
@@ -45,7 +47,8 @@ void conv_transpose2d_forward(View<float, 4> y, View<const float, 4> x,
               const std::int64_t m = table.begin + r;
               const std::int64_t j = m % W, i = m / W % H, b = m / W / H;
               table.x[r] = x.data() + b * x.stride(0) + i * x.stride(1) + j * x.stride(2);
-              table.y[r] = y.data() + b * y.stride(0) + (k * i + ky) * y.stride(1) + (k * j + kx) * y.stride(2);
+              table.y[r] = y.data() + b * y.stride(0) + (k * i + ky) * y.stride(1) +
+                           (k * j + kx) * y.stride(2);
             }
           },
           ctx);

@@ -18,17 +18,19 @@ namespace lvggt::kernels::HWY_NAMESPACE {
 
 template <Activation kActivation>
 HWY_INLINE hn::Vec<Floats> activate(Floats d, hn::Vec<Floats> x) {
-  if constexpr (kActivation == Activation::kRelu) return hn::IfThenZeroElse(hn::Lt(x, hn::Zero(d)), x);
+  if constexpr (kActivation == Activation::kRelu)
+    return hn::IfThenZeroElse(hn::Lt(x, hn::Zero(d)), x);
   if constexpr (kActivation == Activation::kGelu) return gelu(d, x);
   if constexpr (kActivation == Activation::kSilu) return silu(d, x);
   if constexpr (kActivation == Activation::kSigmoid) return sigmoid(d, x);
   return x;
 }
 
-// The epilogue of rows [first, last) of a chunk and channels [n0, n1); sums start at channel n0, rows are kSumPitch apart.
+// The epilogue of rows [first, last) of a chunk and channels [n0, n1); sums start at channel n0,
+// rows are kSumPitch apart.
 template <Activation kActivation>
-void finish(const Product& p, const RowTable& table, const float* HWY_RESTRICT sums, std::int64_t first,
-            std::int64_t last, std::int64_t n0, std::int64_t n1) {
+void finish(const Product& p, const RowTable& table, const float* HWY_RESTRICT sums,
+            std::int64_t first, std::int64_t last, std::int64_t n0, std::int64_t n1) {
   const Floats d;
   for (std::int64_t r = first; r < last; ++r) {
     const float* HWY_RESTRICT sum = sums + r * kSumPitch;
@@ -45,14 +47,19 @@ void finish(const Product& p, const RowTable& table, const float* HWY_RESTRICT s
   }
 }
 
-inline void finish_any(const Product& p, const RowTable& table, const float* sums, std::int64_t first,
-                std::int64_t last, std::int64_t n0, std::int64_t n1) {
+inline void finish_any(const Product& p, const RowTable& table, const float* sums,
+                       std::int64_t first, std::int64_t last, std::int64_t n0, std::int64_t n1) {
   switch (p.activation) {
-    case Activation::kNone: return finish<Activation::kNone>(p, table, sums, first, last, n0, n1);
-    case Activation::kRelu: return finish<Activation::kRelu>(p, table, sums, first, last, n0, n1);
-    case Activation::kGelu: return finish<Activation::kGelu>(p, table, sums, first, last, n0, n1);
-    case Activation::kSilu: return finish<Activation::kSilu>(p, table, sums, first, last, n0, n1);
-    case Activation::kSigmoid: return finish<Activation::kSigmoid>(p, table, sums, first, last, n0, n1);
+    case Activation::kNone:
+      return finish<Activation::kNone>(p, table, sums, first, last, n0, n1);
+    case Activation::kRelu:
+      return finish<Activation::kRelu>(p, table, sums, first, last, n0, n1);
+    case Activation::kGelu:
+      return finish<Activation::kGelu>(p, table, sums, first, last, n0, n1);
+    case Activation::kSilu:
+      return finish<Activation::kSilu>(p, table, sums, first, last, n0, n1);
+    case Activation::kSigmoid:
+      return finish<Activation::kSigmoid>(p, table, sums, first, last, n0, n1);
   }
 }
 

@@ -20,8 +20,14 @@ void linear_forward(View<float, 2> y, View<const float, 2> x, const PackedMatrix
               "linear: residual is ", epilogue.residual.shape(), " but y is ", y.shape());
 
   const View<const float, 2> residual = epilogue.residual;
-  const kernels::Product product{M, &w, 1, K, epilogue.bias.data(), epilogue.activation,
-                                 epilogue.gamma.data(), !residual.empty()};
+  const kernels::Product product{M,
+                                 &w,
+                                 1,
+                                 K,
+                                 epilogue.bias.data(),
+                                 epilogue.activation,
+                                 epilogue.gamma.data(),
+                                 !residual.empty()};
   const auto gather = [&](const kernels::RowTable& table) {
     for (std::int64_t r = 0; r < table.count; ++r) {
       const std::int64_t m = table.begin + r;

@@ -10,7 +10,8 @@ namespace kernels {
 
 PackedMatrix empty_matrix(std::int64_t N, std::int64_t taps, std::int64_t K, Storage storage) {
   if (storage == Storage::kI8)
-    fail(ErrorKind::kUnsupported, "pack: int8 is a storage for linear layers only, not for ", taps, " taps");
+    fail(ErrorKind::kUnsupported, "pack: int8 is a storage for linear layers only, not for ", taps,
+         " taps");
   const std::int64_t values = num_panels(N) * taps * K * kPanelWidth;
   PackedMatrix matrix{N, taps, K, storage, {}, {}, {}};
   matrix.panels =
@@ -26,8 +27,13 @@ PackedMatrix pack_int8(View<const float, 2> weight) {
   const auto [N, K] = weight.shape();
   const std::int64_t quads = (K + 3) / 4;
   const std::int64_t padded = num_panels(N) * kPanelWidth;
-  PackedMatrix packed{N, 1, K, Storage::kI8, Tensor<std::byte, 1>(Shape{padded * quads * 4}),
-                      Tensor<float, 1>(Shape{padded}), Tensor<std::int32_t, 1>(Shape{padded})};
+  PackedMatrix packed{N,
+                      1,
+                      K,
+                      Storage::kI8,
+                      Tensor<std::byte, 1>(Shape{padded * quads * 4}),
+                      Tensor<float, 1>(Shape{padded}),
+                      Tensor<std::int32_t, 1>(Shape{padded})};
   for (std::int64_t n = 0; n < N; ++n) {
     const float* row = weight.data() + n * weight.stride(0);
     float largest = 0;
@@ -38,8 +44,8 @@ PackedMatrix pack_int8(View<const float, 2> weight) {
     auto* lines = reinterpret_cast<std::int8_t*>(packed.panels.data()) +
                   (n / kPanelWidth * quads * kPanelWidth + n % kPanelWidth) * 4;
     for (std::int64_t k = 0; k < K; ++k) {
-      const auto q = static_cast<std::int8_t>(
-          std::clamp(std::nearbyint(row[k] * inverse), -1.0f * kInt8WeightMax, 1.0f * kInt8WeightMax));
+      const auto q = static_cast<std::int8_t>(std::clamp(
+          std::nearbyint(row[k] * inverse), -1.0f * kInt8WeightMax, 1.0f * kInt8WeightMax));
       lines[k / 4 * kPanelWidth * 4 + k % 4] = q;
       packed.weight_sums(n) += q;
     }

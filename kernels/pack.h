@@ -15,10 +15,17 @@ inline void set_weight(PackedMatrix& matrix, std::int64_t n, std::int64_t line, 
   const std::int64_t i =
       (n / kPanelWidth * matrix.taps * matrix.K + line) * kPanelWidth + n % kPanelWidth;
   switch (matrix.storage) {
-    case Storage::kF32: reinterpret_cast<float*>(matrix.panels.data())[i] = value; break;
-    case Storage::kBf16: reinterpret_cast<bfloat16*>(matrix.panels.data())[i] = to_bfloat16(value); break;
-    case Storage::kF16: reinterpret_cast<float16*>(matrix.panels.data())[i] = to_float16(value); break;
-    case Storage::kI8: break;  // empty_matrix refuses it
+    case Storage::kF32:
+      reinterpret_cast<float*>(matrix.panels.data())[i] = value;
+      break;
+    case Storage::kBf16:
+      reinterpret_cast<bfloat16*>(matrix.panels.data())[i] = to_bfloat16(value);
+      break;
+    case Storage::kF16:
+      reinterpret_cast<float16*>(matrix.panels.data())[i] = to_float16(value);
+      break;
+    case Storage::kI8:
+      break;  // empty_matrix refuses it
   }
 }
 

@@ -35,7 +35,8 @@ std::string cgroup_path(const std::string& controller) {
     const auto second = line.find(':', first + 1);
     if (first == std::string::npos || second == std::string::npos) continue;
     const std::string names = "," + line.substr(first + 1, second - first - 1) + ",";
-    if (names == "," + controller + "," || (!controller.empty() && names.find("," + controller + ",") != std::string::npos))
+    if (names == "," + controller + "," ||
+        (!controller.empty() && names.find("," + controller + ",") != std::string::npos))
       return line.substr(second + 1);
   }
   return "/";
@@ -46,8 +47,10 @@ double quota_of(const std::string& directory) {
   double quota = 0, period = 0;
   if (std::ifstream file(directory + "/cpu.max"); file >> quota >> period && period > 0)
     return quota / period;
-  std::ifstream quota_file(directory + "/cpu.cfs_quota_us"), period_file(directory + "/cpu.cfs_period_us");
-  if (quota_file >> quota && period_file >> period && quota > 0 && period > 0) return quota / period;
+  std::ifstream quota_file(directory + "/cpu.cfs_quota_us"),
+      period_file(directory + "/cpu.cfs_period_us");
+  if (quota_file >> quota && period_file >> period && quota > 0 && period > 0)
+    return quota / period;
   return 0;
 }
 
@@ -84,8 +87,9 @@ int available_threads(std::string* reason) {
 
 namespace {
 
-// A hand-over of work from one thread to another. oneTBB orders these itself; ThreadSanitizer cannot see
-// that inside a libtbb that was not built for it and is told here. Does nothing in other builds.
+// A hand-over of work from one thread to another. oneTBB orders these itself; ThreadSanitizer
+// cannot see that inside a libtbb that was not built for it and is told here. Does nothing in other
+// builds.
 struct HandOver {
   void give() {
 #ifdef LVGGT_TSAN_ANNOTATIONS
@@ -105,7 +109,8 @@ struct Context::Threads {
   explicit Threads(int n) : arena(n) {
     // oneTBB starts no more workers than there are CPUs unless it is told to.
     if (n > tbb::this_task_arena::max_concurrency())
-      more_than_cpus.emplace(tbb::global_control::max_allowed_parallelism, static_cast<std::size_t>(n));
+      more_than_cpus.emplace(tbb::global_control::max_allowed_parallelism,
+                             static_cast<std::size_t>(n));
   }
   std::optional<tbb::global_control> more_than_cpus;
   tbb::task_arena arena;
@@ -114,7 +119,8 @@ struct Context::Threads {
 
 Context::Context(int num_threads) {
   if (num_threads < 0 || num_threads > kMaxThreads)
-    fail(ErrorKind::kUsage, "threads: ", num_threads, " is not between 0 (all available) and ", kMaxThreads);
+    fail(ErrorKind::kUsage, "threads: ", num_threads, " is not between 0 (all available) and ",
+         kMaxThreads);
   num_threads_ = num_threads == 0 ? available_threads() : num_threads;
   threads_ = std::make_unique<Threads>(num_threads_);
 }
@@ -139,7 +145,8 @@ void parallel_chunks(std::int64_t num_chunks, FunctionRef<void(std::int64_t, int
           HandOver& place = threads.workers[static_cast<std::size_t>(worker)];
           start.take();
           place.take();
-          for (std::int64_t chunk = range.begin(); chunk != range.end(); ++chunk) body(chunk, worker);
+          for (std::int64_t chunk = range.begin(); chunk != range.end(); ++chunk)
+            body(chunk, worker);
           place.give();
           done.give();
         },

@@ -19,10 +19,10 @@ namespace lvggt::kernels {
 
 // What one worker needs for one chunk.
 struct ChunkScratch {
-  float* input = nullptr;             // [kChunkRows, kInputPitch]
-  float* sums = nullptr;              // [kChunkRows, kSumPitch]
+  float* input = nullptr;              // [kChunkRows, kInputPitch]
+  float* sums = nullptr;               // [kChunkRows, kSumPitch]
   const float** input_rows = nullptr;  // [kChunkRows]
-  float* widened = nullptr;            // [kTilePanels, kBlockK, 16]: lines of narrow weights as floats
+  float* widened = nullptr;  // [kTilePanels, kBlockK, 16]: lines of narrow weights as floats
 };
 // Panels of the widest tile of any instruction set.
 inline constexpr std::int64_t kMaxTilePanels = 3;
@@ -53,7 +53,8 @@ struct Panels {
   std::int64_t stride;  // floats between two panels
 };
 
-// Lines [line, line + num_lines) of `count` panels from `panel` on, widened if they are stored narrow.
+// Lines [line, line + num_lines) of `count` panels from `panel` on, widened if they are stored
+// narrow.
 Panels block_panels(const Product& p, std::int64_t panel, std::int64_t count, std::int64_t line,
                     std::int64_t num_lines, const ChunkScratch& scratch) {
   const std::int64_t panel_lines = p.taps * p.K;
@@ -62,14 +63,14 @@ Panels block_panels(const Product& p, std::int64_t panel, std::int64_t count, st
     return {reinterpret_cast<const float*>(p.w->panels.data()) + first, panel_lines * kPanelWidth};
   }
   for (std::int64_t i = 0; i < count; ++i) {
-    widen_lines(p.w->storage, p.w->panels.data() + 2 * (first + i * panel_lines * kPanelWidth), num_lines,
-                scratch.widened + i * kBlockK * kPanelWidth);
+    widen_lines(p.w->storage, p.w->panels.data() + 2 * (first + i * panel_lines * kPanelWidth),
+                num_lines, scratch.widened + i * kBlockK * kPanelWidth);
   }
   return {scratch.widened, kBlockK * kPanelWidth};
 }
 
-// One K block: `taps` taps of K values each, for all rows and panels of the chunk. The rows' table has
-// row_stride addresses a tap; `lines` is where the block starts inside a panel.
+// One K block: `taps` taps of K values each, for all rows and panels of the chunk. The rows' table
+// has row_stride addresses a tap; `lines` is where the block starts inside a panel.
 void run_block(const Product& p, const RowTable& table, std::int64_t panel0, std::int64_t panel1,
                const float* const* rows, std::int64_t row_stride, std::int64_t taps, std::int64_t K,
                std::int64_t lines, bool is_first, bool is_last, const ChunkScratch& scratch) {
@@ -85,7 +86,7 @@ void run_block(const Product& p, const RowTable& table, std::int64_t panel0, std
                        kSumPitch);
       } else {
         tile_of<true>(count, rows + r, row_stride, taps, K, panels.lines, panels.stride, out,
-                       kSumPitch);
+                      kSumPitch);
       }
       if (is_last) finish_any(p, table, sums, r, std::min(table.count, r + kTileRows), n0, n1);
     }
@@ -165,7 +166,8 @@ void run_product(const Product& product, FunctionRef<void(const RowTable&)> gath
         }
         const std::int64_t panel0 = chunk % panel_chunks * kChunkPanels;
         run(product, table, panel0, std::min(panels, panel0 + kChunkPanels),
-            {inputs[worker].data(), sums[worker].data(), input_rows[worker].data(), widened[worker].data()});
+            {inputs[worker].data(), sums[worker].data(), input_rows[worker].data(),
+             widened[worker].data()});
       },
       ctx);
 }

@@ -12,15 +12,18 @@
 namespace lvggt::kernels {
 
 // A chunk is the unit of parallel work and of reuse: kChunkRows rows times kChunkPanels panels.
-//  - its inputs for one K block (96 x 256 floats, 96 KiB) and its sums (96 x 384 floats, 144 KiB) stay in a
+//  - its inputs for one K block (96 x 256 floats, 96 KiB) and its sums (96 x 384 floats, 144 KiB)
+//  stay in a
 //    second-level cache of 512 KiB together with the panels in use;
 //  - a panel line group is read from there once for all 96 rows;
 //  - 782 tokens x 3072 channels give 72 chunks: enough for dozens of threads to balance.
 inline constexpr std::int64_t kChunkRows = 96;  // a multiple of every tile's rows
 inline constexpr std::int64_t kChunkPanels = 24;
-// Lines of a panel summed before moving on: 256 lines of one panel are 16 KiB, half of a first-level cache.
+// Lines of a panel summed before moving on: 256 lines of one panel are 16 KiB, half of a
+// first-level cache.
 inline constexpr std::int64_t kBlockK = 256;
-// Row pitch of copied inputs: not a multiple of 4 KiB, so that rows do not compete for the same cache sets.
+// Row pitch of copied inputs: not a multiple of 4 KiB, so that rows do not compete for the same
+// cache sets.
 inline constexpr std::int64_t kInputPitch = kBlockK + 16;
 inline constexpr std::int64_t kSumPitch = kChunkPanels * kPanelWidth + 16;
 
@@ -29,9 +32,9 @@ inline constexpr std::int64_t kSumPitch = kChunkPanels * kPanelWidth + 16;
 struct RowTable {
   std::int64_t begin = 0;
   std::int64_t count = 0;
-  std::int64_t capacity = 0;   // distance between the inputs of two taps
-  const float** x = nullptr;   // [taps, capacity]
-  float** y = nullptr;         // [capacity]
+  std::int64_t capacity = 0;         // distance between the inputs of two taps
+  const float** x = nullptr;         // [taps, capacity]
+  float** y = nullptr;               // [capacity]
   const float** residual = nullptr;  // [capacity]; unused without a residual
 };
 
@@ -39,7 +42,8 @@ struct RowTable {
 struct Product {
   std::int64_t M = 0;
   const PackedMatrix* w = nullptr;
-  std::int64_t taps = 0;  // taps * K lines a panel: the weight's own, or neighbouring taps read as one
+  std::int64_t taps =
+      0;  // taps * K lines a panel: the weight's own, or neighbouring taps read as one
   std::int64_t K = 0;
   const float* bias = nullptr;
   Activation activation = Activation::kNone;
@@ -47,12 +51,12 @@ struct Product {
   bool has_residual = false;
 };
 
-// Runs a product with f32, bf16 or f16 weights; gather(table) fills in the addresses of the rows it is asked for. It is called from
-// worker threads and may run more than once for the same rows.
+// Runs a product with f32, bf16 or f16 weights; gather(table) fills in the addresses of the rows it
+// is asked for. It is called from worker threads and may run more than once for the same rows.
 void run_product(const Product& product, FunctionRef<void(const RowTable&)> gather, Context& ctx);
 
-// Runs a product with int8 weights: each row of x is rounded to multiples of its largest magnitude / 127, the
-// integers are multiplied and summed exactly.
+// Runs a product with int8 weights: each row of x is rounded to multiples of its largest magnitude
+// / 127, the integers are multiplied and summed exactly.
 //   x: [M, K]
 void run_product_int8(const Product& product, View<const float, 2> x,
                       FunctionRef<void(const RowTable&)> gather, Context& ctx);

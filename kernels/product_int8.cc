@@ -18,10 +18,11 @@
 #define LVGGT_PRODUCT_INT8_ONCE
 namespace lvggt::kernels {
 
-// Activations are stored as unsigned bytes q + 128, because the integer dot products take one unsigned side;
-// 128 times the channel's weight sum is taken off again at the end.
+// Activations are stored as unsigned bytes q + 128, because the integer dot products take one
+// unsigned side; 128 times the channel's weight sum is taken off again at the end.
 inline constexpr std::int32_t kActivationZero = 128;
-// Quads (4 neighbours of K) summed before moving on: 256 of one panel are 16 KiB, half of a first-level cache.
+// Quads (4 neighbours of K) summed before moving on: 256 of one panel are 16 KiB, half of a
+// first-level cache.
 inline constexpr std::int64_t kBlockQuads = 256;
 
 // The rows of x as integers.
@@ -38,13 +39,14 @@ HWY_BEFORE_NAMESPACE();
 namespace lvggt::kernels::HWY_NAMESPACE {
 namespace {
 
-// As kTileRows, less what the two-step dot product of 16 registers needs: 4 x 2 sums, 2 lines, a row's bytes, the pair sums
-// and a vector of ones.
+// As kTileRows, less what the two-step dot product of 16 registers needs: 4 x 2 sums, 2 lines, a
+// row's bytes, the pair sums and a vector of ones.
 inline constexpr int kInt8Rows = kLanes == 16 ? 8 : kLanes == 8 ? 4 : 2;
 
-// q = round(x / scale) + 128 with scale = largest magnitude / 127; a row of zeros has scale 0. NaN and infinity make the
-// scale, and with it the whole row of the product, NaN.
-void quantize_row(const float* HWY_RESTRICT x, std::int64_t K, std::uint8_t* HWY_RESTRICT q, float* scale) {
+// q = round(x / scale) + 128 with scale = largest magnitude / 127; a row of zeros has scale 0. NaN
+// and infinity make the scale, and with it the whole row of the product, NaN.
+void quantize_row(const float* HWY_RESTRICT x, std::int64_t K, std::uint8_t* HWY_RESTRICT q,
+                  float* scale) {
   const Floats d;
   const Ints di;
   auto largest = hn::Zero(d);
@@ -54,7 +56,8 @@ void quantize_row(const float* HWY_RESTRICT x, std::int64_t K, std::uint8_t* HWY
     largest = hn::Max(largest, hn::Abs(v));
     poison = hn::Add(poison, hn::Sub(v, v));
   }
-  const float top = hn::GetLane(hn::MaxOfLanes(d, largest)) + hn::GetLane(hn::SumOfLanes(d, poison));
+  const float top =
+      hn::GetLane(hn::MaxOfLanes(d, largest)) + hn::GetLane(hn::SumOfLanes(d, poison));
   *scale = top / 127;
   const auto inverse = hn::Set(d, top > 0 ? 127 / top : 0.0f);
   const auto zero = hn::Set(di, kActivationZero);
@@ -67,9 +70,9 @@ void quantize_row(const float* HWY_RESTRICT x, std::int64_t K, std::uint8_t* HWY
 
 // out[r][n] (+)= sum over quads of rows[r] . panels[n]; as tile(), in integers.
 template <int kPanels, bool kAccumulate>
-HWY_NOINLINE void int8_tile(const std::uint8_t* HWY_RESTRICT rows, std::int64_t pitch, std::int64_t quads,
-                            const std::int8_t* HWY_RESTRICT panels, std::int64_t panel_stride,
-                            std::int32_t* HWY_RESTRICT out) {
+HWY_NOINLINE void int8_tile(const std::uint8_t* HWY_RESTRICT rows, std::int64_t pitch,
+                            std::int64_t quads, const std::int8_t* HWY_RESTRICT panels,
+                            std::int64_t panel_stride, std::int32_t* HWY_RESTRICT out) {
   constexpr int kVectors = kPanels * kPanelVectors;
   const Ints d;
   hn::Vec<Ints> sum[kInt8Rows][kVectors];
@@ -85,7 +88,8 @@ HWY_NOINLINE void int8_tile(const std::uint8_t* HWY_RESTRICT rows, std::int64_t 
 #pragma GCC unroll 8
     for (int v = 0; v < kVectors; ++v) {
       const std::int8_t* line = panels + (v / kPanelVectors) * panel_stride + k * kPanelWidth * 4;
-      b[v] = hn::LoadU(d, reinterpret_cast<const std::int32_t*>(line) + (v % kPanelVectors) * kLanes);
+      b[v] =
+          hn::LoadU(d, reinterpret_cast<const std::int32_t*>(line) + (v % kPanelVectors) * kLanes);
     }
 #pragma GCC unroll 8
     for (int r = 0; r < kInt8Rows; ++r) {
@@ -105,11 +109,13 @@ HWY_NOINLINE void int8_tile(const std::uint8_t* HWY_RESTRICT rows, std::int64_t 
 
 template <bool kAccumulate>
 HWY_INLINE void int8_tile_of(std::int64_t num_panels, const std::uint8_t* rows, std::int64_t pitch,
-                             std::int64_t quads, const std::int8_t* panels, std::int64_t panel_stride,
-                             std::int32_t* out) {
+                             std::int64_t quads, const std::int8_t* panels,
+                             std::int64_t panel_stride, std::int32_t* out) {
   if constexpr (kTilePanels >= 3) {
-    if (num_panels == 3) return int8_tile<3, kAccumulate>(rows, pitch, quads, panels, panel_stride, out);
-    if (num_panels == 2) return int8_tile<2, kAccumulate>(rows, pitch, quads, panels, panel_stride, out);
+    if (num_panels == 3)
+      return int8_tile<3, kAccumulate>(rows, pitch, quads, panels, panel_stride, out);
+    if (num_panels == 2)
+      return int8_tile<2, kAccumulate>(rows, pitch, quads, panels, panel_stride, out);
   }
   int8_tile<1, kAccumulate>(rows, pitch, quads, panels, panel_stride, out);
 }
@@ -124,7 +130,8 @@ void dequantize(const Product& p, const QuantizedRows& x, std::int64_t row0, std
     float* row = sums + r * kSumPitch;
     for (std::int64_t i = 0; i < channels; i += kLanes) {
       const auto sum = hn::BitCast(di, hn::LoadU(d, row + i));
-      const auto offset = hn::Mul(hn::LoadU(di, p.w->weight_sums.data() + n0 + i), hn::Set(di, kActivationZero));
+      const auto offset =
+          hn::Mul(hn::LoadU(di, p.w->weight_sums.data() + n0 + i), hn::Set(di, kActivationZero));
       const auto scale = hn::Mul(row_scale, hn::LoadU(d, p.w->scales.data() + n0 + i));
       hn::StoreU(hn::Mul(hn::ConvertTo(d, hn::Sub(sum, offset)), scale), d, row + i);
     }
@@ -132,8 +139,8 @@ void dequantize(const Product& p, const QuantizedRows& x, std::int64_t row0, std
 }
 
 // One chunk: all of K for the rows of the table and panels [panel0, panel1).
-void run_int8_chunk(const Product& p, const QuantizedRows& x, const RowTable& table, std::int64_t panel0,
-                    std::int64_t panel1, float* sums) {
+void run_int8_chunk(const Product& p, const QuantizedRows& x, const RowTable& table,
+                    std::int64_t panel0, std::int64_t panel1, float* sums) {
   const std::int64_t quads = (p.K + 3) / 4;
   const std::int64_t panel_stride = quads * kPanelWidth * 4;
   const std::uint8_t* rows = x.values + table.begin * x.pitch;
@@ -177,8 +184,9 @@ void run_product_int8(const Product& product, View<const float, 2> x,
   const std::int64_t panels = num_panels(product.w->N);
   if (M == 0 || panels == 0) return;
   Arena::Scope scope(ctx.arena());
-  // Room for a whole vector beyond K; an odd number of cache lines, so that rows do not compete for the same
-  // sets. Tiles read whole: a few rows beyond the last one are there to be read, and their sums dropped.
+  // Room for a whole vector beyond K; an odd number of cache lines, so that rows do not compete for
+  // the same sets. Tiles read whole: a few rows beyond the last one are there to be read, and their
+  // sums dropped.
   const std::int64_t pitch = ((K + 16 + 63) / 64 | 1) * 64;
   const auto values = ctx.arena().alloc<std::uint8_t>(Shape{M + 8, pitch});
   const auto scales = ctx.arena().alloc(Shape{M});
@@ -187,7 +195,8 @@ void run_product_int8(const Product& product, View<const float, 2> x,
   parallel_rows(
       M, 16,
       [&](std::int64_t begin, std::int64_t end) {
-        for (std::int64_t m = begin; m < end; ++m) quantize(x.data() + m * x.stride(0), K, values[m].data(), &scales[m]);
+        for (std::int64_t m = begin; m < end; ++m)
+          quantize(x.data() + m * x.stride(0), K, values[m].data(), &scales[m]);
       },
       ctx);
 
@@ -199,21 +208,21 @@ void run_product_int8(const Product& product, View<const float, 2> x,
   const auto residual_rows = ctx.arena().alloc<const float*>(Shape{workers, kChunkRows});
   const std::int64_t panel_chunks = (panels + kChunkPanels - 1) / kChunkPanels;
   const auto run = HWY_DYNAMIC_DISPATCH(run_int8_chunk);
-  parallel_chunks(
-      (M + kChunkRows - 1) / kChunkRows * panel_chunks,
-      [&](std::int64_t chunk, int worker) {
-        RowTable table;
-        table.begin = chunk / panel_chunks * kChunkRows;
-        table.count = std::min(kChunkRows, M - table.begin);
-        table.capacity = kChunkRows;
-        table.x = x_rows[worker].data();
-        table.y = y_rows[worker].data();
-        table.residual = residual_rows[worker].data();
-        gather(table);
-        const std::int64_t panel0 = chunk % panel_chunks * kChunkPanels;
-        run(product, quantized, table, panel0, std::min(panels, panel0 + kChunkPanels), sums[worker].data());
-      },
-      ctx);
+  parallel_chunks((M + kChunkRows - 1) / kChunkRows * panel_chunks,
+                  [&](std::int64_t chunk, int worker) {
+                    RowTable table;
+                    table.begin = chunk / panel_chunks * kChunkRows;
+                    table.count = std::min(kChunkRows, M - table.begin);
+                    table.capacity = kChunkRows;
+                    table.x = x_rows[worker].data();
+                    table.y = y_rows[worker].data();
+                    table.residual = residual_rows[worker].data();
+                    gather(table);
+                    const std::int64_t panel0 = chunk % panel_chunks * kChunkPanels;
+                    run(product, quantized, table, panel0, std::min(panels, panel0 + kChunkPanels),
+                        sums[worker].data());
+                  },
+                  ctx);
 }
 
 }  // namespace lvggt::kernels

@@ -39,12 +39,14 @@ HWY_INLINE void store_first(hn::Vec<D> v, D d, float* p, std::int64_t n) {
   }
 }
 
-// Lanes of four bytes each: sum + a.b, with a unsigned and b signed, |b| <= 63 so that a0 b0 + a1 b1 fits 16 bits.
-// Highway 1.0.3 has no operation for this, and it decides the speed of the int8 product.
+// Lanes of four bytes each: sum + a.b, with a unsigned and b signed, |b| <= 63 so that a0 b0 + a1
+// b1 fits 16 bits. Highway 1.0.3 has no operation for this, and it decides the speed of the int8
+// product.
 using Ints = hn::RebindToSigned<Floats>;
 
 #if HWY_TARGET == HWY_SCALAR
-HWY_INLINE hn::Vec<Ints> dot4_portable(Ints d, hn::Vec<Ints> sum, hn::Vec<Ints> a, hn::Vec<Ints> b) {
+HWY_INLINE hn::Vec<Ints> dot4_portable(Ints d, hn::Vec<Ints> sum, hn::Vec<Ints> a,
+                                       hn::Vec<Ints> b) {
   const std::int32_t bytes_a = hn::GetLane(a), bytes_b = hn::GetLane(b);
   std::int32_t total = hn::GetLane(sum);
   for (int i = 0; i < 32; i += 8) {
@@ -53,7 +55,8 @@ HWY_INLINE hn::Vec<Ints> dot4_portable(Ints d, hn::Vec<Ints> sum, hn::Vec<Ints> 
   return hn::Set(d, total);
 }
 #else
-HWY_INLINE hn::Vec<Ints> dot4_portable(Ints d, hn::Vec<Ints> sum, hn::Vec<Ints> a, hn::Vec<Ints> b) {
+HWY_INLINE hn::Vec<Ints> dot4_portable(Ints d, hn::Vec<Ints> sum, hn::Vec<Ints> a,
+                                       hn::Vec<Ints> b) {
   const hn::Repartition<std::int16_t, Ints> d16;
   const auto a16 = hn::BitCast(d16, a);
   const auto b16 = hn::BitCast(d16, b);
@@ -62,12 +65,14 @@ HWY_INLINE hn::Vec<Ints> dot4_portable(Ints d, hn::Vec<Ints> sum, hn::Vec<Ints> 
   const auto b_even = hn::ShiftRight<8>(hn::ShiftLeft<8>(b16));
   const auto b_odd = hn::ShiftRight<8>(b16);
   const auto pairs = hn::BitCast(d, hn::Add(hn::Mul(a_even, b_even), hn::Mul(a_odd, b_odd)));
-  return hn::Add(sum, hn::Add(hn::ShiftRight<16>(hn::ShiftLeft<16>(pairs)), hn::ShiftRight<16>(pairs)));
+  return hn::Add(sum,
+                 hn::Add(hn::ShiftRight<16>(hn::ShiftLeft<16>(pairs)), hn::ShiftRight<16>(pairs)));
 }
 #endif
 
 #if HWY_TARGET == HWY_AVX3_DL
-// The CPU has the instruction whenever this target is chosen, but Highway does not enable it for the compiler.
+// The CPU has the instruction whenever this target is chosen, but Highway does not enable it for
+// the compiler.
 HWY_INLINE hn::Vec<Ints> dot4(Ints, hn::Vec<Ints> sum, hn::Vec<Ints> a, hn::Vec<Ints> b) {
   asm("vpdpbusd %2, %1, %0" : "+v"(sum.raw) : "v"(a.raw), "v"(b.raw));
   return sum;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Narrow storage widened to float lines, a block at a time: products read the block many times from the cache,
-// so that widening costs a few percent and there is one inner loop for all storages.
+// Narrow storage widened to float lines, a block at a time: products read the block many times from
+// the cache, so that widening costs a few percent and there is one inner loop for all storages.
 #if defined(LVGGT_KERNELS_STORAGE_INL_H_) == defined(HWY_TARGET_TOGGLE)
 #ifdef LVGGT_KERNELS_STORAGE_INL_H_
 #undef LVGGT_KERNELS_STORAGE_INL_H_
@@ -56,7 +56,8 @@ inline void widen_lines_by_lane(const std::int8_t* HWY_RESTRICT from, std::int64
                                 const float* HWY_RESTRICT lane_scales, float* HWY_RESTRICT to) {
   const Floats d;
   for (std::int64_t i = 0; i < num_lines * kPanelWidth; i += kLanes) {
-    hn::StoreU(hn::Mul(widen_i8(d, from + i), hn::LoadU(d, lane_scales + i % kPanelWidth)), d, to + i);
+    hn::StoreU(hn::Mul(widen_i8(d, from + i), hn::LoadU(d, lane_scales + i % kPanelWidth)), d,
+               to + i);
   }
 }
 

@@ -15,29 +15,31 @@
 HWY_BEFORE_NAMESPACE();
 namespace lvggt::kernels::HWY_NAMESPACE {
 
-// Tile sizes. A step along K loads the panels' lines, broadcasts one value a row and does rows x vectors
-// multiply-adds, so the accumulators should fill the register file:
+// Tile sizes. A step along K loads the panels' lines, broadcasts one value a row and does rows x
+// vectors multiply-adds, so the accumulators should fill the register file:
 //   32 registers of 16 lanes: 8 rows x 3 panels = 24 accumulators + 3 lines + 1 broadcast
-//   16 registers of  8 lanes: 6 rows x 1 panel  = 12 accumulators + 2 vectors of the line + 1 broadcast
-//   32 registers of  4 lanes: 6 rows x 1 panel  = 24 + 4 + 1
-//   16 registers of  4 lanes: 2 rows x 1 panel  =  8 + 4 + 1
-// Each hides the latency of a multiply-add (4 cycles, 2 a cycle: 8 accumulators at least), and loads less
-// than one vector for each of them. All numbers of rows divide 24.
-inline constexpr bool kManyRegisters = HWY_TARGET == HWY_AVX3 || HWY_TARGET == HWY_AVX3_DL ||
-                                       HWY_TARGET == HWY_NEON;
+//   16 registers of  8 lanes: 6 rows x 1 panel  = 12 accumulators + 2 vectors of the line + 1
+//   broadcast 32 registers of  4 lanes: 6 rows x 1 panel  = 24 + 4 + 1 16 registers of  4 lanes: 2
+//   rows x 1 panel  =  8 + 4 + 1
+// Each hides the latency of a multiply-add (4 cycles, 2 a cycle: 8 accumulators at least), and
+// loads less than one vector for each of them. All numbers of rows divide 24.
+inline constexpr bool kManyRegisters =
+    HWY_TARGET == HWY_AVX3 || HWY_TARGET == HWY_AVX3_DL || HWY_TARGET == HWY_NEON;
 inline constexpr int kTileRows = kLanes == 16 ? 8 : (kLanes == 8 || kManyRegisters) ? 6 : 2;
 inline constexpr int kTilePanels = kLanes == 16 ? 3 : 1;
 inline constexpr int kPanelVectors = static_cast<int>(kPanelWidth) / kLanes;
 
-// out[r][n] (+)= sum over taps t and k < K of rows[t * row_table_stride + r][k] * panels[n / 16][t * K + k][n % 16]
-//   for r < kTileRows and n < 16 kPanels; panels are panel_stride floats apart. All rows are read: callers
-//   point the ones beyond the matrix at any readable row and drop their sums.
-// Not inlined: surrounded by other code, the row addresses no longer fit the registers, and reloading them at each
-// step costs a fifth of the speed (measured with 16 registers).
+// out[r][n] (+)= sum over taps t and k < K of rows[t * row_table_stride + r][k] * panels[n / 16][t
+// * K + k][n % 16]
+//   for r < kTileRows and n < 16 kPanels; panels are panel_stride floats apart. All rows are read:
+//   callers point the ones beyond the matrix at any readable row and drop their sums.
+// Not inlined: surrounded by other code, the row addresses no longer fit the registers, and
+// reloading them at each step costs a fifth of the speed (measured with 16 registers).
 template <int kPanels, bool kAccumulate>
-HWY_NOINLINE void tile(const float* const* HWY_RESTRICT rows, std::int64_t row_table_stride, std::int64_t taps,
-                     std::int64_t K, const float* HWY_RESTRICT panels, std::int64_t panel_stride,
-                     float* HWY_RESTRICT out, std::int64_t out_stride) {
+HWY_NOINLINE void tile(const float* const* HWY_RESTRICT rows, std::int64_t row_table_stride,
+                       std::int64_t taps, std::int64_t K, const float* HWY_RESTRICT panels,
+                       std::int64_t panel_stride, float* HWY_RESTRICT out,
+                       std::int64_t out_stride) {
   constexpr int kVectors = kPanels * kPanelVectors;
   const Floats d;
   hn::Vec<Floats> sum[kTileRows][kVectors];
@@ -58,7 +60,8 @@ HWY_NOINLINE void tile(const float* const* HWY_RESTRICT rows, std::int64_t row_t
       hn::Vec<Floats> b[kVectors];
 #pragma GCC unroll 8
       for (int v = 0; v < kVectors; ++v) {
-        b[v] = hn::LoadU(d, line + (v / kPanelVectors) * panel_stride + (v % kPanelVectors) * kLanes);
+        b[v] =
+            hn::LoadU(d, line + (v / kPanelVectors) * panel_stride + (v % kPanelVectors) * kLanes);
       }
 #pragma GCC unroll 8
       for (int r = 0; r < kTileRows; ++r) {
@@ -75,7 +78,8 @@ HWY_NOINLINE void tile(const float* const* HWY_RESTRICT rows, std::int64_t row_t
   }
 }
 
-// Splits num_panels into groups of at most kTilePanels, as even as possible, and calls group(first, count).
+// Splits num_panels into groups of at most kTilePanels, as even as possible, and calls group(first,
+// count).
 template <class Group>
 HWY_INLINE void for_panel_groups(std::int64_t num_panels, const Group& group) {
   const std::int64_t groups = (num_panels + kTilePanels - 1) / kTilePanels;
@@ -95,10 +99,12 @@ HWY_INLINE void tile_of(std::int64_t num_panels, const float* const* HWY_RESTRIC
                         float* HWY_RESTRICT out, std::int64_t out_stride) {
   if constexpr (kTilePanels >= 3) {
     if (num_panels == 3) {
-      return tile<3, kAccumulate>(rows, row_table_stride, taps, K, panels, panel_stride, out, out_stride);
+      return tile<3, kAccumulate>(rows, row_table_stride, taps, K, panels, panel_stride, out,
+                                  out_stride);
     }
     if (num_panels == 2) {
-      return tile<2, kAccumulate>(rows, row_table_stride, taps, K, panels, panel_stride, out, out_stride);
+      return tile<2, kAccumulate>(rows, row_table_stride, taps, K, panels, panel_stride, out,
+                                  out_stride);
     }
   }
   tile<1, kAccumulate>(rows, row_table_stride, taps, K, panels, panel_stride, out, out_stride);

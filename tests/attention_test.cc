@@ -8,6 +8,7 @@
 #include <limits>
 #include <vector>
 
+#include "lvggt/core/float16.h"
 #include "tests/reference/attention.h"
 #include "tests/support/compare.h"
 #include "tests/support/random.h"
@@ -24,13 +25,12 @@ class Groups {
  public:
   // Splits the tokens of k and v, [Nk, heads, D], into groups of the given sizes.
   Groups(View<const float, 3> k, View<const float, 3> v, const std::vector<std::int64_t>& sizes,
-         Context& ctx) {
+         Context& ctx, Storage storage = Storage::kF32) {
     const std::int64_t heads = k.extent(1), D = k.extent(2);
     std::int64_t begin = 0;
     for (const std::int64_t size : sizes) {
-      keys_.emplace_back(Shape{packed_keys_size(heads, size, D)});
-      values_.emplace_back(Shape{packed_values_size(heads, size, D)});
-      groups_.push_back({keys_.back().data(), values_.back().data(), heads, size, D});
+      buffers_.emplace_back(Shape{keys_values_layout(storage, heads, size, D).size});
+      groups_.push_back({buffers_.back().data(), storage, heads, size, D});
       pack_keys_values(groups_.back(), k.narrow(0, begin, begin + size),
                        v.narrow(0, begin, begin + size), ctx);
       begin += size;
@@ -39,7 +39,7 @@ class Groups {
   std::span<const PackedKeysValues> packed() const { return groups_; }
 
  private:
-  std::vector<Tensor<float, 1>> keys_, values_;
+  std::vector<Tensor<std::byte, 1>> buffers_;
   std::vector<PackedKeysValues> groups_;
 };
 
@@ -233,4 +233,63 @@ TEST_CASE("attention: shapes that do not fit are refused by name") {
                        doctest::Contains("[3,1,16]"), Error);
   CHECK_THROWS_WITH_AS(pack_keys_values(groups.packed()[0], k, y, ctx),
                        doctest::Contains("[3,2,16]"), Error);
+}
+
+namespace {
+
+// What pack_keys_values keeps of x, as floats.
+Tensor<float, 3> stored(const Tensor<float, 3>& x, Storage storage) {
+  Tensor<float, 3> y = x.clone();
+  const auto [P, heads, D] = x.shape();
+  for (std::int64_t row = 0; row < P * heads; ++row) {
+    float* values = y.data() + row * D;
+    float largest = 0;
+    for (std::int64_t i = 0; i < D; ++i) largest = std::max(largest, std::abs(values[i]));
+    for (std::int64_t i = 0; i < D; ++i) {
+      if (storage == Storage::kBf16) {
+        values[i] = to_float(to_bfloat16(values[i]));
+      } else {
+        values[i] = largest > 0 ? std::nearbyint(values[i] * (127 / largest)) * (largest / 127) : 0;
+      }
+    }
+  }
+  return y;
+}
+
+}  // namespace
+
+TEST_CASE(
+    "attention: bf16 and int8 keys and values count as what they were rounded to, bit for bit") {
+  Context ctx(2);
+  for_each_target([&] {
+    for (const Storage storage : {Storage::kBf16, Storage::kI8}) {
+      for (const std::int64_t D : {8, 24, 64}) {
+        CAPTURE(D);
+        auto k = random_tensor(Shape{261, 2, D}, 2), v = random_tensor(Shape{261, 2, D}, 3);
+        const auto q = random_tensor(Shape{29, 2, D}, 1);
+        for (std::int64_t i = 0; i < D; ++i) k(17, 1, i) = v(17, 0, i) = 0;
+        const std::vector<std::int64_t> sizes{5, 251, 5};
+        Tensor<float, 3> narrow(q.shape()), wide(q.shape());
+        scaled_dot_product_attention(narrow, q, Groups(k, v, sizes, ctx, storage).packed(), 0.3f,
+                                     ctx);
+        scaled_dot_product_attention(
+            wide, q, Groups(stored(k, storage), stored(v, storage), sizes, ctx).packed(), 0.3f,
+            ctx);
+        CHECK_SAME_BITS(narrow, wide);
+      }
+    }
+  });
+}
+
+TEST_CASE(
+    "attention: NaN in a key or value is seen through int8 storage, and f16 is refused by name") {
+  Context ctx(1);
+  auto k = random_tensor(Shape{6, 1, 16}, 1);
+  const auto q = random_tensor(Shape{2, 1, 16}, 2), v = random_tensor(Shape{6, 1, 16}, 3);
+  k(3, 0, 5) = std::numeric_limits<float>::quiet_NaN();
+  Tensor<float, 3> y(q.shape());
+  scaled_dot_product_attention(y, q, Groups(k, v, {6}, ctx, Storage::kI8).packed(), 1, ctx);
+  CHECK(std::isnan(y(1, 0, 0)));
+  CHECK_THROWS_WITH_AS(Groups(q, q, {2}, ctx, Storage::kF16), doctest::Contains("not as f16"),
+                       Error);
 }

@@ -193,12 +193,10 @@ TEST_CASE("attention without a mask, across, and with the frame mask: as the ref
         const bool masked = op == "attention_framemask";
         const std::int64_t tokens = masked ? 4 : k.extent(0), heads = k.extent(1), D = k.extent(2);
         std::vector<PackedKeysValues> groups;
-        std::vector<Tensor<float, 1>> buffers;
+        std::vector<Tensor<std::byte, 1>> buffers;
         for (std::int64_t begin = 0; begin < k.extent(0); begin += tokens) {
-          buffers.emplace_back(Shape{packed_keys_size(heads, tokens, D)});
-          float* keys = buffers.back().data();
-          buffers.emplace_back(Shape{packed_values_size(heads, tokens, D)});
-          groups.push_back({keys, buffers.back().data(), heads, tokens, D});
+          buffers.emplace_back(Shape{keys_values_layout(Storage::kF32, heads, tokens, D).size});
+          groups.push_back({buffers.back().data(), Storage::kF32, heads, tokens, D});
           pack_keys_values(groups.back(), k.view().narrow(0, begin, begin + tokens),
                            v.view().narrow(0, begin, begin + tokens), ops.ctx);
         }

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
-// Products with weights in narrow storage: the same as with the rounded weights, exactly or to float rounding.
+// Products with weights in narrow storage: the same as with the rounded weights, exactly or to
+// float rounding.
 #include "lvggt/core/storage.h"
 
 #include <doctest/doctest.h>
@@ -32,14 +33,17 @@ Tensor<float, R> rounded(const Tensor<float, R>& x, Storage storage) {
   return y;
 }
 
-// The int8 product by its definition: both sides rounded to integers, multiplied and summed exactly.
+// The int8 product by its definition: both sides rounded to integers, multiplied and summed
+// exactly.
 Tensor<double, 2> int8_product(const Tensor<float, 2>& x, const Tensor<float, 2>& w) {
   const std::int64_t M = x.extent(0), N = w.extent(0), K = x.extent(1);
   const auto quantize = [K](View<const float, 1> row, int top, std::vector<double>& q) {
     float largest = 0;
     for (std::int64_t k = 0; k < K; ++k) largest = std::max(largest, std::abs(row[k]));
-    const float inverse = top == kInt8WeightMax ? 1 / (largest / static_cast<float>(top)) : static_cast<float>(top) / largest;
-    for (std::int64_t k = 0; k < K; ++k) q[static_cast<std::size_t>(k)] = largest > 0 ? std::nearbyint(row[k] * inverse) : 0;
+    const float inverse = top == kInt8WeightMax ? 1 / (largest / static_cast<float>(top))
+                                                : static_cast<float>(top) / largest;
+    for (std::int64_t k = 0; k < K; ++k)
+      q[static_cast<std::size_t>(k)] = largest > 0 ? std::nearbyint(row[k] * inverse) : 0;
     return static_cast<double>(largest) / top;
   };
   Tensor<double, 2> y(Shape{M, N});
@@ -62,15 +66,18 @@ TEST_CASE("storage: bf16 and f16 weights give the product with the rounded weigh
   Context ctx(2);
   for_each_target([&] {
     for (const Storage storage : {Storage::kBf16, Storage::kF16}) {
-      for (const Shape<3> size : {Shape{1, 1, 1}, Shape{5, 17, 30}, Shape{99, 70, 300}, Shape{8, 400, 1030}}) {
+      for (const Shape<3> size :
+           {Shape{1, 1, 1}, Shape{5, 17, 30}, Shape{99, 70, 300}, Shape{8, 400, 1030}}) {
         CAPTURE(size[2]);
-        const auto x = random_tensor(Shape{size[0], size[2]}, 1), w = random_tensor(Shape{size[1], size[2]}, 2);
+        const auto x = random_tensor(Shape{size[0], size[2]}, 1),
+                   w = random_tensor(Shape{size[1], size[2]}, 2);
         Tensor<float, 2> narrow(Shape{size[0], size[1]}), wide(narrow.shape());
         linear_forward(narrow, x, pack_linear(w, storage), {}, ctx);
         linear_forward(wide, x, pack_linear(rounded(w, storage)), {}, ctx);
         CHECK_SAME_BITS(narrow, wide);
       }
-      const auto x = random_tensor(Shape{1, 9, 11, 40}, 3), w = random_tensor(Shape{35, 40, 3, 3}, 4);
+      const auto x = random_tensor(Shape{1, 9, 11, 40}, 3),
+                 w = random_tensor(Shape{35, 40, 3, 3}, 4);
       Tensor<float, 4> narrow(Shape{1, 9, 11, 35}), wide(narrow.shape());
       conv2d_forward(narrow, x, pack_conv2d(w, 1, 1, storage), {}, ctx);
       conv2d_forward(wide, x, pack_conv2d(rounded(w, storage), 1, 1), {}, ctx);
@@ -87,9 +94,11 @@ TEST_CASE("storage: bf16 and f16 weights give the product with the rounded weigh
 TEST_CASE("storage: int8 products are exact sums of the rounded operands") {
   Context ctx(2);
   for_each_target([&] {
-    for (const Shape<3> size : {Shape{1, 1, 1}, Shape{3, 17, 7}, Shape{9, 50, 64}, Shape{101, 33, 130}, Shape{5, 400, 1100}}) {
+    for (const Shape<3> size : {Shape{1, 1, 1}, Shape{3, 17, 7}, Shape{9, 50, 64},
+                                Shape{101, 33, 130}, Shape{5, 400, 1100}}) {
       CAPTURE(size[2]);
-      const auto x = random_tensor(Shape{size[0], size[2]}, 1), w = random_tensor(Shape{size[1], size[2]}, 2);
+      const auto x = random_tensor(Shape{size[0], size[2]}, 1),
+                 w = random_tensor(Shape{size[1], size[2]}, 2);
       Tensor<float, 2> y(Shape{size[0], size[1]});
       linear_forward(y, x, pack_linear(w, Storage::kI8), {}, ctx);
       // The integer sum is exact; converting and scaling round four times.
@@ -128,8 +137,9 @@ TEST_CASE("storage: int8 products keep epilogues, zero rows, and the NaN of a ro
     const PackedMatrix packed = pack_linear(w, Storage::kI8);
     Tensor<float, 2> plain(Shape{11, 21}), fused(plain.shape());
     linear_forward(plain, x, packed, {}, ctx);
-    linear_forward(fused, x, packed,
-                   {.bias = bias, .activation = Activation::kRelu, .gamma = gamma, .residual = residual}, ctx);
+    linear_forward(
+        fused, x, packed,
+        {.bias = bias, .activation = Activation::kRelu, .gamma = gamma, .residual = residual}, ctx);
     for (std::int64_t m = 0; m < 11; ++m) {
       for (std::int64_t n = 0; n < 21; ++n) {
         if (m == 6 || m == 7) {
@@ -144,7 +154,8 @@ TEST_CASE("storage: int8 products keep epilogues, zero rows, and the NaN of a ro
   });
 }
 
-TEST_CASE("storage: int8 products are the same bits for 1 and 8 threads and on every instruction set") {
+TEST_CASE(
+    "storage: int8 products are the same bits for 1 and 8 threads and on every instruction set") {
   Context one(1), eight(8);
   const auto x = random_tensor(Shape{301, 200}, 1), w = random_tensor(Shape{410, 200}, 2);
   const PackedMatrix packed = pack_linear(w, Storage::kI8);
@@ -160,7 +171,8 @@ TEST_CASE("storage: int8 products are the same bits for 1 and 8 threads and on e
 
 TEST_CASE("storage: a name that is none and int8 for a convolution are refused by name") {
   CHECK(parse_storage("bf16", "--weights-storage") == Storage::kBf16);
-  CHECK_THROWS_WITH_AS(parse_storage("int4", "--weights-storage"), doctest::Contains("--weights-storage: 'int4'"), Error);
+  CHECK_THROWS_WITH_AS(parse_storage("int4", "--weights-storage"),
+                       doctest::Contains("--weights-storage: 'int4'"), Error);
   const Tensor<float, 4> w(Shape{4, 4, 3, 3});
   CHECK_THROWS_WITH_AS(pack_conv2d(w, 1, 1, Storage::kI8), doctest::Contains("int8"), Error);
 }

@@ -10,9 +10,10 @@
 
 namespace lvggt {
 
-// Scratch memory handed out by bumping an offset and taken back as a whole when a Scope ends. It grows on
-// first use; when the outermost scope ends the blocks are merged into one as large as the peak, so that
-// the same work done again does not touch the heap. Not thread-safe: one arena belongs to one caller.
+// Scratch memory handed out by bumping an offset and taken back as a whole when a Scope ends. It
+// grows on first use; when the outermost scope ends the blocks are merged into one as large as the
+// peak, so that the same work done again does not touch the heap. Not thread-safe: one arena
+// belongs to one caller.
 class Arena {
  public:
   Arena() = default;
@@ -42,9 +43,9 @@ class Arena {
   // An uninitialised dense array, valid until the innermost open scope ends.
   template <class T = float, int R>
   View<T, R> alloc(Shape<R> shape) {
-    return View<T, R>(reinterpret_cast<T*>(
-                          alloc_bytes(static_cast<std::size_t>(shape.volume()) * sizeof(T))),
-                      shape);
+    return View<T, R>(
+        reinterpret_cast<T*>(alloc_bytes(static_cast<std::size_t>(shape.volume()) * sizeof(T))),
+        shape);
   }
 
   // Most bytes ever in use at once.
@@ -59,7 +60,8 @@ class Arena {
       used_ = 0;
     }
     if (block_ == blocks_.size()) {
-      // At least half of what there is already, so that few blocks suffice whatever the request sizes.
+      // At least half of what there is already, so that few blocks suffice whatever the request
+      // sizes.
       std::size_t total = 0;
       for (const auto& block : blocks_) total += block.num_bytes();
       const std::size_t size = std::max({bytes, total / 2, kMinBlock});

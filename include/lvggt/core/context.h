@@ -8,8 +8,9 @@
 
 namespace lvggt {
 
-// Threads this process may use: the CPUs of its affinity mask, at most the cgroup's CPU quota rounded
-// down, at least 1. When `reason` is given it receives a phrase saying which of them decided.
+// Threads this process may use: the CPUs of its affinity mask, at most the cgroup's CPU quota
+// rounded down, at least 1. When `reason` is given it receives a phrase saying which of them
+// decided.
 int available_threads(std::string* reason = nullptr);
 
 // Most threads a Context accepts.

@@ -22,26 +22,31 @@ enum class ErrorKind {
   kInterrupted,  // the user asked to stop
 };
 
-// Exit status of a program that ends with an error of this kind: 1 failed at run time, 2 wrong usage,
-// 3 bad input, 4 memory or a limit, 130 interrupted. (0 is done, 5 a partial result.)
+// Exit status of a program that ends with an error of this kind: 1 failed at run time, 2 wrong
+// usage, 3 bad input, 4 memory or a limit, 130 interrupted. (0 is done, 5 a partial result.)
 constexpr int exit_code(ErrorKind kind) {
   switch (kind) {
-    case ErrorKind::kUsage: return 2;
+    case ErrorKind::kUsage:
+      return 2;
     case ErrorKind::kRead:
     case ErrorKind::kFormat:
     case ErrorKind::kUnsupported:
-    case ErrorKind::kMismatch: return 3;
+    case ErrorKind::kMismatch:
+      return 3;
     case ErrorKind::kLimit:
-    case ErrorKind::kMemory: return 4;
-    case ErrorKind::kInterrupted: return 130;
+    case ErrorKind::kMemory:
+      return 4;
+    case ErrorKind::kInterrupted:
+      return 130;
     case ErrorKind::kNumeric:
-    case ErrorKind::kWrite: return 1;
+    case ErrorKind::kWrite:
+      return 1;
   }
   return 1;
 }
 
-// The only exception type the library throws itself. what() is one sentence: what was wrong, in which
-// file, tensor or option, what was expected and what was found.
+// The only exception type the library throws itself. what() is one sentence: what was wrong, in
+// which file, tensor or option, what was expected and what was found.
 class Error : public std::runtime_error {
  public:
   Error(ErrorKind kind, const std::string& message) : std::runtime_error(message), kind_(kind) {}
@@ -67,12 +72,13 @@ template <class... Args>
 
 }  // namespace lvggt
 
-// Checks what a caller or a file must guarantee, in every build; the message names the operator and both
-// values: LVGGT_CHECK(x.extent(1) == C, "layer_norm: x is ", x.shape(), " but gamma is ", gamma.shape()).
-#define LVGGT_CHECK(condition, ...)                                 \
-  do {                                                              \
-    if (!(condition)) [[unlikely]]                                  \
-      ::lvggt::fail(::lvggt::ErrorKind::kMismatch, __VA_ARGS__);    \
+// Checks what a caller or a file must guarantee, in every build; the message names the operator and
+// both values: LVGGT_CHECK(x.extent(1) == C, "layer_norm: x is ", x.shape(), " but gamma is ",
+// gamma.shape()).
+#define LVGGT_CHECK(condition, ...)                              \
+  do {                                                           \
+    if (!(condition)) [[unlikely]]                               \
+      ::lvggt::fail(::lvggt::ErrorKind::kMismatch, __VA_ARGS__); \
   } while (false)
 
 // Checks our own invariants, in debug builds only.

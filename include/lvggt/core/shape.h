@@ -9,13 +9,16 @@
 
 namespace lvggt {
 
-// Extents of an R-dimensional array, outermost first. Unpacks as `const auto [S, P, C] = x.shape();`.
+// Extents of an R-dimensional array, outermost first. Unpacks as `const auto [S, P, C] =
+// x.shape();`.
 template <int R>
 struct Shape {
   static_assert(R >= 1);
   std::array<std::int64_t, R> extents{};
 
-  constexpr std::int64_t operator[](int axis) const { return extents[static_cast<std::size_t>(axis)]; }
+  constexpr std::int64_t operator[](int axis) const {
+    return extents[static_cast<std::size_t>(axis)];
+  }
   constexpr std::int64_t& operator[](int axis) { return extents[static_cast<std::size_t>(axis)]; }
 
   // Number of elements.
@@ -48,7 +51,8 @@ Shape(Extents...) -> Shape<static_cast<int>(sizeof...(Extents))>;
 }  // namespace lvggt
 
 template <int R>
-struct std::tuple_size<lvggt::Shape<R>> : std::integral_constant<std::size_t, static_cast<std::size_t>(R)> {};
+struct std::tuple_size<lvggt::Shape<R>>
+    : std::integral_constant<std::size_t, static_cast<std::size_t>(R)> {};
 template <std::size_t I, int R>
 struct std::tuple_element<I, lvggt::Shape<R>> {
   using type = std::int64_t;

@@ -8,13 +8,14 @@
 
 namespace lvggt {
 
-// How packed weights and cached keys and values are kept. Everything is computed from float32; the narrower
-// types save memory, and int8 weights time, at the price of rounding.
+// How packed weights and cached keys and values are kept. Everything is computed from float32; the
+// narrower types save memory, and int8 weights time, at the price of rounding.
 enum class Storage {
   kF32,
   kBf16,  // 8 bits of mantissa
   kF16,   // 11 bits of mantissa, largest value 65504
-  kI8,    // integers times a scale: one an output channel (weights), one a token and head (keys, values)
+  kI8,    // integers times a scale: one an output channel (weights), one a token and head (keys,
+          // values)
 };
 
 constexpr std::size_t storage_bytes(Storage storage) {
@@ -23,10 +24,14 @@ constexpr std::size_t storage_bytes(Storage storage) {
 
 constexpr std::string_view storage_name(Storage storage) {
   switch (storage) {
-    case Storage::kF32: return "f32";
-    case Storage::kBf16: return "bf16";
-    case Storage::kF16: return "f16";
-    case Storage::kI8: return "int8";
+    case Storage::kF32:
+      return "f32";
+    case Storage::kBf16:
+      return "bf16";
+    case Storage::kF16:
+      return "f16";
+    case Storage::kI8:
+      return "int8";
   }
   return "";
 }

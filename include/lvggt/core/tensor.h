@@ -19,8 +19,9 @@ namespace lvggt {
 // Every owned buffer starts on a cache line, which is also the widest vector.
 inline constexpr std::size_t kAlignment = 64;
 
-// Borrows an R-dimensional array. The last axis is contiguous, outer axes may be strided, so that a slice
-// of channels or a frame is a view too. Passed by value; an empty view (no data) means "not given".
+// Borrows an R-dimensional array. The last axis is contiguous, outer axes may be strided, so that a
+// slice of channels or a frame is a view too. Passed by value; an empty view (no data) means "not
+// given".
 template <class T, int R>
 class View {
  public:
@@ -43,8 +44,7 @@ class View {
 
   // View<float, R> converts to View<const float, R>.
   template <class U>
-    requires std::is_same_v<const U, T>
-  View(const View<U, R>& other)
+  requires std::is_same_v<const U, T> View(const View<U, R>& other)
       : data_(other.data()), shape_(other.shape()), strides_(other.strides()) {}
 
   T* data() const { return data_; }
@@ -72,8 +72,7 @@ class View {
 
   // One element; for tests and cold code.
   template <class... Indices>
-    requires(sizeof...(Indices) == R)
-  T& operator()(Indices... indices) const {
+  requires(sizeof...(Indices) == R) T& operator()(Indices... indices) const {
     const std::array<std::int64_t, R> index{static_cast<std::int64_t>(indices)...};
     std::int64_t offset = 0;
     for (std::size_t axis = 0; axis < R; ++axis) offset += index[axis] * strides_[axis];
@@ -122,7 +121,7 @@ class Tensor {
     for (const std::int64_t extent : shape.extents)
       LVGGT_CHECK(extent >= 0, "tensor: shape ", shape, " has a negative extent");
     const std::size_t bytes = std::max<std::size_t>(num_bytes(), 1);
-    data_.reset(static_cast<T*>(::operator new(bytes, std::align_val_t{kAlignment})));
+    data_.reset(static_cast<T*>(::operator new (bytes, std::align_val_t{kAlignment})));
     std::memset(static_cast<void*>(data_.get()), 0, num_bytes());
   }
   Tensor(Tensor&& other) noexcept
@@ -165,7 +164,7 @@ class Tensor {
 
  private:
   struct Free {
-    void operator()(T* p) const { ::operator delete(p, std::align_val_t{kAlignment}); }
+    void operator()(T* p) const { ::operator delete (p, std::align_val_t{kAlignment}); }
   };
   std::unique_ptr<T, Free> data_;
   Shape<R> shape_{};

@@ -7,7 +7,8 @@
 
 namespace lvggt {
 
-// A convolution's weights, packed once at load. Square kernels only: 1x1, 2x2 s2, 3x3 s1/s2 p1, 14x14 s14.
+// A convolution's weights, packed once at load. Square kernels only: 1x1, 2x2 s2, 3x3 s1/s2 p1,
+// 14x14 s14.
 struct PackedConv2d {
   std::int64_t in_channels = 0;
   std::int64_t kernel = 0;
@@ -26,8 +27,8 @@ constexpr std::int64_t conv2d_extent(std::int64_t in, std::int64_t kernel, std::
   return (in + 2 * padding - kernel) / stride + 1;
 }
 
-// y = epilogue(conv2d(x, w)), channels last; rows and pixels of x, y and the residual may be strided, so
-// that y can be a slice of a wider, concatenated map.
+// y = epilogue(conv2d(x, w)), channels last; rows and pixels of x, y and the residual may be
+// strided, so that y can be a slice of a wider, concatenated map.
 //   y: [B, Ho, Wo, Cout]   x: [B, H, W, Cin]   y may be epilogue.residual, not x.
 void conv2d_forward(View<float, 4> y, View<const float, 4> x, const PackedConv2d& w,
                     const Epilogue<4>& epilogue, Context& ctx);

@@ -8,8 +8,8 @@
 
 namespace lvggt {
 
-// A transposed convolution with stride == kernel: every input pixel writes its own k x k block, so it is a
-// product for each of the k x k places, all with the same input rows. Packed once at load.
+// A transposed convolution with stride == kernel: every input pixel writes its own k x k block, so
+// it is a product for each of the k x k places, all with the same input rows. Packed once at load.
 struct PackedConvTranspose2d {
   std::int64_t in_channels = 0;
   std::int64_t out_channels = 0;
@@ -18,12 +18,14 @@ struct PackedConvTranspose2d {
 };
 
 // weight: [Cin, Cout, k, k], as PyTorch stores it; int8 is refused.
-PackedConvTranspose2d pack_conv_transpose2d(View<const float, 4> weight, Storage storage = Storage::kF32);
+PackedConvTranspose2d pack_conv_transpose2d(View<const float, 4> weight,
+                                            Storage storage = Storage::kF32);
 
-// y[b, k*i + ky, k*j + kx, :] = sum over Cin of x[b, i, j, :] w[:, :, ky, kx] + bias, channels last; pixels
-// may be strided.
+// y[b, k*i + ky, k*j + kx, :] = sum over Cin of x[b, i, j, :] w[:, :, ky, kx] + bias, channels
+// last; pixels may be strided.
 //   y: [B, k*H, k*W, Cout]   x: [B, H, W, Cin]   bias: [Cout] or empty
 void conv_transpose2d_forward(View<float, 4> y, View<const float, 4> x,
-                              const PackedConvTranspose2d& w, View<const float, 1> bias, Context& ctx);
+                              const PackedConvTranspose2d& w, View<const float, 1> bias,
+                              Context& ctx);
 
 }  // namespace lvggt

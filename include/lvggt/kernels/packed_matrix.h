@@ -14,10 +14,12 @@ inline constexpr std::int64_t kPanelWidth = 16;
 
 constexpr std::int64_t num_panels(std::int64_t n) { return (n + kPanelWidth - 1) / kPanelWidth; }
 
-// The right-hand side of a product, packed once at load: panel p holds output channels 16p .. 16p+15, line
-// by line along the summed axis. A product with several taps (a convolution) sums tap by tap.
+// The right-hand side of a product, packed once at load: panel p holds output channels 16p ..
+// 16p+15, line by line along the summed axis. A product with several taps (a convolution) sums tap
+// by tap.
 //   f32, bf16, f16  [num_panels(N), taps * K, 16]
-//   int8            [num_panels(N), ceil(K / 4), 16, 4]: four neighbours of K for each channel, as the
+//   int8            [num_panels(N), ceil(K / 4), 16, 4]: four neighbours of K for each channel, as
+//   the
 //                   integer dot-product instructions read them; taps is 1
 // Channels beyond N and neighbours beyond K are zero.
 struct PackedMatrix {
@@ -26,7 +28,7 @@ struct PackedMatrix {
   std::int64_t K = 0;     // summed extent of one tap
   Storage storage = Storage::kF32;
   Tensor<std::byte, 1> panels;
-  Tensor<float, 1> scales;             // int8: weight = scale * integer   [16 num_panels(N)]
+  Tensor<float, 1> scales;              // int8: weight = scale * integer   [16 num_panels(N)]
   Tensor<std::int32_t, 1> weight_sums;  // int8: of a channel's integers    [16 num_panels(N)]
 
   bool empty() const { return panels.empty(); }
@@ -35,12 +37,12 @@ struct PackedMatrix {
   }
 };
 
-// Largest magnitude of an int8 weight: 7 bits, so that the sum of two products with 8-bit activations fits 16 bits and
-// nothing saturates.
+// Largest magnitude of an int8 weight: 7 bits, so that the sum of two products with 8-bit
+// activations fits 16 bits and nothing saturates.
 inline constexpr int kInt8WeightMax = 63;
 
-// weight: [N, K], as a linear layer stores it. int8 rounds each output channel to multiples of its largest
-// magnitude / kInt8WeightMax.
+// weight: [N, K], as a linear layer stores it. int8 rounds each output channel to multiples of its
+// largest magnitude / kInt8WeightMax.
 PackedMatrix pack_linear(View<const float, 2> weight, Storage storage = Storage::kF32);
 
 }  // namespace lvggt

@@ -23,23 +23,25 @@ inline constexpr std::int64_t kMaxPastFrames = std::int64_t{1} << 24;
 class KvCache {
  public:
   KvCache(std::int64_t num_layers, std::int64_t num_heads, std::int64_t head_dim,
-          std::int64_t tokens_per_frame, std::int64_t max_past_frames)
+          std::int64_t tokens_per_frame, std::int64_t max_past_frames,
+          Storage storage = Storage::kF32)
       : num_layers_(num_layers),
         num_heads_(num_heads),
         head_dim_(head_dim),
         tokens_per_frame_(tokens_per_frame),
-        max_past_frames_(max_past_frames) {
+        max_past_frames_(max_past_frames),
+        storage_(storage),
+        group_bytes_(keys_values_layout(storage, num_heads, tokens_per_frame, head_dim).size) {
     if (max_past_frames < 1 || max_past_frames > kMaxPastFrames)
       fail(ErrorKind::kUsage, "kv_cache: the number of past frames must lie in [1, ",
            kMaxPastFrames, "], not ", max_past_frames);
     const double total = static_cast<double>(capacity()) * static_cast<double>(num_layers) *
-                         static_cast<double>(group_floats()) * sizeof(float);
+                         static_cast<double>(group_bytes_);
     if (total > 1e14)  // beyond the 47 bits of address space that a process has
       fail(ErrorKind::kMemory, "kv_cache: ", max_past_frames, " past frames would take ", total,
            " bytes; a smaller window fits");
     groups_ = ReservedMemory(static_cast<std::size_t>(capacity()) * sizeof(PackedKeysValues));
-    floats_ = ReservedMemory(static_cast<std::size_t>(capacity() * num_layers * group_floats()) *
-                             sizeof(float));
+    packed_ = ReservedMemory(static_cast<std::size_t>(capacity() * num_layers * group_bytes_));
   }
 
   // Keys and values of the running frame's tokens in one layer; a second call replaces the first.
@@ -72,32 +74,28 @@ class KvCache {
   std::int64_t num_frames() const { return num_frames_; }  // cached, without the running one
 
   // Bytes of a full cache.
-  std::size_t max_bytes() const { return floats_.num_bytes(); }
+  std::size_t max_bytes() const { return packed_.num_bytes(); }
 
  private:
   std::int64_t capacity() const { return max_past_frames_ + 1; }
-  std::int64_t group_floats() const {
-    return packed_keys_size(num_heads_, tokens_per_frame_, head_dim_) +
-           packed_values_size(num_heads_, tokens_per_frame_, head_dim_);
-  }
 
   // Frame `idx` counted from the oldest; idx == num_frames() is the running one. The layers of a
   // frame lie side by side, so that memory is committed frame by frame.
   PackedKeysValues group(std::int64_t idx, std::int64_t layer) const {
     const std::int64_t slot = (oldest_ + idx) % capacity();
-    float* keys =
-        reinterpret_cast<float*>(floats_.data()) + (slot * num_layers_ + layer) * group_floats();
     const std::int64_t tokens = idx == num_frames_ ? running_tokens_ : tokens_per_frame_;
-    return {keys, keys + packed_keys_size(num_heads_, tokens_per_frame_, head_dim_), num_heads_,
+    return {packed_.data() + (slot * num_layers_ + layer) * group_bytes_, storage_, num_heads_,
             tokens, head_dim_};
   }
 
   std::int64_t num_layers_, num_heads_, head_dim_, tokens_per_frame_, max_past_frames_;
-  std::int64_t oldest_ = 0;  // slot
+  Storage storage_;
+  std::int64_t group_bytes_;  // of one frame in one layer
+  std::int64_t oldest_ = 0;   // slot
   std::int64_t num_frames_ = 0;
   std::int64_t running_tokens_ = 0;
   ReservedMemory groups_;  // PackedKeysValues [capacity]
-  ReservedMemory floats_;  // [capacity, layers, keys then values]
+  ReservedMemory packed_;  // [capacity, layers, group_bytes_]
 };
 
 }  // namespace lvggt

@@ -27,9 +27,9 @@ using Attend = FunctionRef<void(View<float, 3> y, View<const float, 3> q, View<c
 // Buffers for the packed keys and values of `tokens` tokens, valid until the arena's scope ends.
 inline PackedKeysValues alloc_keys_values(std::int64_t heads, std::int64_t tokens,
                                           std::int64_t head_dim, Context& ctx) {
-  return {ctx.arena().alloc(Shape{packed_keys_size(heads, tokens, head_dim)}).data(),
-          ctx.arena().alloc(Shape{packed_values_size(heads, tokens, head_dim)}).data(), heads,
-          tokens, head_dim};
+  const std::int64_t bytes = keys_values_layout(Storage::kF32, heads, tokens, head_dim).size;
+  return {ctx.arena().alloc<std::byte>(Shape{bytes}).data(), Storage::kF32, heads, tokens,
+          head_dim};
 }
 
 inline void scaled_dot_product_attention(View<float, 3> y, View<const float, 3> q,
