@@ -47,15 +47,21 @@ std::string check_file(const std::string& path) {
   return head;
 }
 
+// "2 audio, 1 cover picture"; for files without video.
 std::string describe_streams(const AVFormatContext& format) {
   int num_audio = 0, num_cover = 0, num_other = 0;
   for (unsigned i = 0; i < format.nb_streams; ++i) {
-    const AVStream& stream = *format.streams[i];
-    const AVMediaType type = stream.codecpar->codec_type;
+    const AVMediaType type = format.streams[i]->codecpar->codec_type;
     ++(type == AVMEDIA_TYPE_AUDIO ? num_audio : type == AVMEDIA_TYPE_VIDEO ? num_cover : num_other);
   }
-  return concat(num_audio, " audio, ", num_cover, " cover picture and ", num_other,
-                " other streams");
+  std::string text;
+  const auto add = [&](int count, const char* what) {
+    if (count > 0) text += concat(text.empty() ? "" : ", ", count, " ", what);
+  };
+  add(num_audio, "audio");
+  add(num_cover, "cover picture");
+  add(num_other, "other");
+  return text.empty() ? "none at all" : text;
 }
 
 bool is_video(const AVStream& stream) {
@@ -103,6 +109,8 @@ void Demuxer::open(const std::string& path) {
     fail(ErrorKind::kUnsupported, path,
          ": its container format is not supported; MP4, MOV, Matroska, "
          "WebM, AVI and MPEG are");
+  if (opened == AVERROR_EOF)
+    fail(ErrorKind::kFormat, path, ": the video ends before its first frame");
   if (opened < 0) {
     const std::string hint = content_hint(head);
     fail(ErrorKind::kFormat, path, ": cannot be read as a video: ", error_text(opened),
@@ -121,7 +129,8 @@ void Demuxer::choose_stream(const std::string& path, std::vector<std::string>& w
     if (num_video++ == 0) stream_ = format_->streams[i];
   }
   if (!stream_)
-    fail(ErrorKind::kFormat, path, ": has no video stream, but ", describe_streams(*format_));
+    fail(ErrorKind::kFormat, path,
+         ": has no video stream; its streams: ", describe_streams(*format_));
   if (num_video > 1)
     warnings.push_back(concat(path, ": has ", num_video, " video streams, the first one (stream ",
                               stream_->index, ") is used"));
@@ -184,7 +193,10 @@ std::string Demuxer::missing_end() const {
   const std::int64_t num_listed = avformat_index_get_entries_count(stream_);
   if (is_mov && num_packets_ < num_listed)
     return concat("it lists ", num_listed, " packets, but has ", num_packets_);
-  // Half a second or 2 % cover what containers leave unsaid about the last packet's length.
+  // Three frames or 2 % cover what containers leave unsaid about the last packet's length.
+  constexpr double kUsualRate = 25;
+  const double rate = av_q2d(stream_->avg_frame_rate);
+  const double three_frames = 3 / (rate > 0 && std::isfinite(rate) ? rate : kUsualRate);
   if (is_mov || format_->duration <= 0 ||
       format_->duration_estimation_method == AVFMT_DURATION_FROM_BITRATE)
     return {};
@@ -192,7 +204,7 @@ std::string Demuxer::missing_end() const {
   const double start = format_->start_time == AV_NOPTS_VALUE
                            ? 0
                            : static_cast<double>(format_->start_time) / AV_TIME_BASE;
-  if (end_time_ - start >= claimed - std::max(0.5, 0.02 * claimed)) return {};
+  if (end_time_ - start >= claimed - std::max(three_frames, 0.02 * claimed)) return {};
   return concat("it claims ", claimed, " seconds, but has ", end_time_ - start);
 }
 

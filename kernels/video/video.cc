@@ -104,7 +104,9 @@ class VideoSource : public FrameSource {
 
   void count_damage(int error) {
     if (report_.damaged_packets++ == 0)
-      first_damage_ = concat("after frame ", num_decoded_ - 1, ": ", error_text(error));
+      first_damage_ = concat(num_decoded_ == 0 ? concat("before the first frame")
+                                               : concat("after frame ", num_decoded_ - 1),
+                             ": ", error_text(error));
   }
 
   void check_size(std::int64_t index) {
@@ -150,8 +152,8 @@ class VideoSource : public FrameSource {
       const std::string missing = demuxer_.missing_end();
       report_.partial = !missing.empty();
       if (num_decoded_ == 0)
-        fail(ErrorKind::kFormat, path_, ": no frame could be decoded",
-             first_damage_.empty() ? missing : first_damage_);
+        fail(ErrorKind::kFormat, path_, ": no frame could be decoded", missing.empty() ? "" : "; ",
+             missing, first_damage_.empty() ? "" : "; damage ", first_damage_);
       detail::check_start(options_, num_decoded_, "frames");
       if (report_.partial)
         warnings_.push_back(

@@ -19,7 +19,7 @@ struct FrameSourceOptions {
   std::int64_t stride = 1;                                             // >= 1
   std::int64_t max_frames = std::numeric_limits<std::int64_t>::max();  // >= 1
   double images_per_second = 30;  // > 0; gives the frames of a folder, which have no times, theirs
-  Limits limits;                  // of every frame
+  Limits limits{};                // of every frame
 };
 
 struct InputFrame {
