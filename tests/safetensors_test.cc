@@ -61,6 +61,7 @@ TEST_CASE("SafetensorsWriter: what is written is read back in every floating-poi
   out.write("brain", std::span(values).first(2));
   out.write("brain", std::span(values).subspan(2));
   out.write("double", values);
+  out.write("none", std::span<const float>());
   CHECK_FALSE(fs::exists(dir / "a.safetensors"));
   out.finish();
 

@@ -1,15 +1,19 @@
 // SPDX-License-Identifier: Apache-2.0
 // Writes the weights of an untrained model that depend on a seed only.
-#include <chrono>
+#include <algorithm>
+#include <cstdio>
+#include <limits>
+#include <string>
 #include <vector>
 
+#include "lvggt/cli/program.h"
+#include "lvggt/cli/threads.h"
 #include "lvggt/core/context.h"
 #include "lvggt/io/atomic_file.h"
 #include "lvggt/io/safetensors.h"
 #include "lvggt/model/config.h"
 #include "lvggt/model/deterministic_weights.h"
 #include "lvggt/model/tensor_list.h"
-#include "weights/program.h"
 
 namespace {
 
@@ -23,15 +27,15 @@ constexpr const char* kDescription =
     "model runs\n"
     "at full speed and is good for tests and measurements; what it predicts means nothing.";
 
-const std::string kFooter =
-    std::string(
-        "\nExamples:\n"
-        "  weights_init --seed 3 model.safetensors                 the published sizes, 4.9 GB\n"
-        "  weights_init --config small.json model.safetensors      sizes from a JSON file\n"
-        "  weights_init --decoder-out decoder.safetensors geometry.safetensors\n"
-        "                                                          two files, as the releases have "
-        "them\n\n") +
-    lvggt::weights::kExitCodes;
+constexpr const char* kFooter =
+    "Examples:\n"
+    "  weights_init --seed 3 model.safetensors                 the published sizes, 4.9 GB\n"
+    "  weights_init --config small.json model.safetensors      sizes from a JSON file\n"
+    "  weights_init --decoder-out decoder.safetensors geometry.safetensors\n"
+    "                                                          two files, as the releases have "
+    "them\n\n"
+    "Exit status: 0 done, 1 failed at run time, 2 wrong usage, 3 bad input file, 4 memory or a "
+    "limit.";
 
 struct Options {
   std::string output;
@@ -72,11 +76,11 @@ std::int64_t write_weights(const std::string& path, const std::vector<TensorSpec
 }
 
 void report(const std::string& path, std::size_t num_tensors, std::int64_t num_bytes) {
-  std::cout << path << ": " << num_tensors << " tensors, " << lvggt::weights::size_text(num_bytes)
-            << '\n';
+  std::printf("%s: %zu tensors, %s\n", path.c_str(), num_tensors,
+              lvggt::cli::bytes_text(static_cast<std::size_t>(num_bytes)).c_str());
 }
 
-void run(const Options& options) {
+int run(const Options& options) {
   const bool two_files = !options.decoder_output.empty();
   if (two_files && options.part != "all")
     lvggt::fail(lvggt::ErrorKind::kUsage, "--decoder-out writes both parts, so --part ",
@@ -87,7 +91,7 @@ void run(const Options& options) {
   if (two_files) lvggt::check_output_file(options.decoder_output, options.force);
 
   const ModelConfig config = config_of(options.config);
-  lvggt::Context ctx(options.threads);
+  lvggt::Context ctx(lvggt::cli::choose_threads(options.threads).threads);
   std::vector<TensorSpec> specs;
   if (options.part != "decoder") specs = lvggt::geometry_tensors(config);
   const std::vector<TensorSpec> decoder =
@@ -98,13 +102,15 @@ void run(const Options& options) {
   if (two_files)
     report(options.decoder_output, decoder.size(),
            write_weights(options.decoder_output, decoder, config, options.seed, ctx));
+  return 0;
 }
 
 }  // namespace
 
 int main(int argc, char** argv) {
   Options options;
-  CLI::App app(kDescription, "weights_init");
+  lvggt::cli::Program program("weights_init", kDescription, LVGGT_VERSION);
+  CLI::App& app = program.app();
   app.footer(kFooter);
   app.add_option("output", options.output, "The .safetensors file to write")->required();
   app.add_option("--decoder-out", options.decoder_output,
@@ -114,10 +120,9 @@ int main(int argc, char** argv) {
   app.add_option("--part", options.part, "Which tensors")
       ->check(CLI::IsMember({"all", "geometry", "decoder"}))
       ->capture_default_str();
-  app.add_option("--seed", options.seed, "Any whole number; the same one gives the same weights")
-      ->capture_default_str();
-  app.add_option("--threads", options.threads, "Threads; 0 for as many as this process may use")
-      ->capture_default_str();
+  program.add_number<std::uint64_t>("--seed", options.seed, "The same seed gives the same weights",
+                                    0, std::numeric_limits<std::uint64_t>::max());
+  lvggt::cli::add_threads_option(program, options.threads);
   app.add_flag("--force", options.force, "Replace existing files");
-  return lvggt::weights::run_program(app, argc, argv, [&] { run(options); });
+  return program.run(argc, argv, [&] { return run(options); });
 }

@@ -3,7 +3,6 @@
 
 #include <algorithm>
 #include <array>
-#include <bit>
 #include <cstring>
 #include <filesystem>
 #include <numeric>
@@ -11,15 +10,11 @@
 #include "kernels/io/printable.h"
 #include "kernels/io/safetensors_header.h"
 #include "kernels/io/safetensors_index.h"
-#include "lvggt/core/float16.h"
 
 namespace lvggt {
 namespace {
 
 namespace fs = std::filesystem;
-
-static_assert(std::endian::native == std::endian::little,
-              "safetensors is little-endian and so are the machines lvggt runs on");
 
 constexpr std::string_view kIndexName = "model.safetensors.index.json";
 constexpr std::string_view kIndexSuffix = ".index.json";
@@ -79,15 +74,6 @@ SafetensorsHeader read_header(const InputFile& file, const Limits& limits) {
   return header;
 }
 
-template <class T>
-float widen(T value) {
-  if constexpr (std::is_same_v<T, float16> || std::is_same_v<T, bfloat16>) {
-    return to_float(value);
-  } else {
-    return static_cast<float>(value);
-  }
-}
-
 // Reads elements of type T from `offset` block by block and hands each block on.
 template <class T, class Body>
 void for_each_block(const InputFile& file, std::int64_t offset, std::int64_t count, Body&& body) {
@@ -102,12 +88,17 @@ void for_each_block(const InputFile& file, std::int64_t offset, std::int64_t cou
   }
 }
 
-template <class T>
-void read_widened(const InputFile& file, std::int64_t offset, std::span<float> out) {
-  for_each_block<T>(file, offset, static_cast<std::int64_t>(out.size()),
-                    [&](std::span<const T> block, std::int64_t first) {
-                      std::transform(block.begin(), block.end(), out.begin() + first, widen<T>);
-                    });
+void read_widened(const InputFile& file, Dtype dtype, std::int64_t offset, std::span<float> out) {
+  const auto item = static_cast<std::size_t>(dtype_size(dtype));
+  std::vector<std::byte> block(std::min<std::size_t>(out.size(), kBlockElements) * item);
+  while (!out.empty()) {
+    const auto part = out.first(std::min<std::size_t>(out.size(), kBlockElements));
+    const auto bytes = std::span(block).first(part.size() * item);
+    file.read_at(offset, bytes.data(), bytes.size());
+    to_float32(dtype, bytes, part);
+    offset += static_cast<std::int64_t>(bytes.size());
+    out = out.subspan(part.size());
+  }
 }
 
 template <class T>
@@ -230,22 +221,13 @@ void Safetensors::read_part(std::string_view name, std::int64_t first, std::span
   const InputFile& file = files_[entry.file_idx];
   // In range, because the part lies inside the tensor and the tensor inside the file.
   const std::int64_t offset = entry.offset + first * dtype_size(entry.dtype);
-  switch (entry.dtype) {
-    case Dtype::kF32:
-      file.read_at(offset, out.data(), out.size_bytes());
-      break;
-    case Dtype::kF16:
-      read_widened<float16>(file, offset, out);
-      break;
-    case Dtype::kBF16:
-      read_widened<bfloat16>(file, offset, out);
-      break;
-    case Dtype::kF64:
-      read_widened<double>(file, offset, out);
-      break;
-    default:
-      fail(ErrorKind::kMismatch, path_, ": tensor ", in_quotes(name), " holds ",
-           dtype_name(entry.dtype), ", but floating-point numbers are expected");
+  if (!dtype_is_float(entry.dtype))
+    fail(ErrorKind::kMismatch, path_, ": tensor ", in_quotes(name), " holds ",
+         dtype_name(entry.dtype), ", but floating-point numbers are expected");
+  if (entry.dtype == Dtype::kF32) {
+    file.read_at(offset, out.data(), out.size_bytes());
+  } else {
+    read_widened(file, entry.dtype, offset, out);
   }
   file.check_unchanged();
 }

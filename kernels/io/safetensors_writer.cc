@@ -4,7 +4,6 @@
 
 #include "kernels/io/printable.h"
 #include "kernels/io/safetensors_header.h"
-#include "lvggt/core/float16.h"
 #include "lvggt/io/checked.h"
 #include "lvggt/io/safetensors.h"
 
@@ -17,17 +16,6 @@ constexpr std::size_t kDataAlignment = 64;
 
 // Elements converted at a time.
 constexpr std::size_t kBlockElements = std::size_t{1} << 16;
-
-template <class T, class Convert>
-std::span<const std::byte> convert_block(std::span<const float> values,
-                                         std::vector<std::byte>& block, Convert convert) {
-  block.resize(values.size() * sizeof(T));
-  for (std::size_t i = 0; i < values.size(); ++i) {
-    const T value = convert(values[i]);
-    std::memcpy(block.data() + i * sizeof(T), &value, sizeof(T));
-  }
-  return block;
-}
 
 // JSON string literal; text that is not UTF-8 is an error of the caller.
 std::string json_string(const std::string& text, const std::string& path) {
@@ -160,32 +148,24 @@ void SafetensorsWriter::append(std::string_view name, std::span<const std::byte>
 }
 
 void SafetensorsWriter::write(std::string_view name, std::span<const std::byte> bytes) {
+  if (bytes.empty() && by_name_.contains(name)) return;  // whole tensors may be empty, and parts
   append(name, bytes);
   skip_complete();
 }
 
 void SafetensorsWriter::write(std::string_view name, std::span<const float> values) {
+  if (values.empty() && by_name_.contains(name)) return;
   const Dtype dtype = current(name).entry.dtype;
   std::vector<std::byte> block;
   for (std::size_t first = 0; first < values.size(); first += kBlockElements) {
     const auto part = values.subspan(first, std::min(kBlockElements, values.size() - first));
-    switch (dtype) {
-      case Dtype::kF32:
-        append(name, std::as_bytes(part));
-        break;
-      case Dtype::kF16:
-        append(name, convert_block<float16>(part, block, to_float16));
-        break;
-      case Dtype::kBF16:
-        append(name, convert_block<bfloat16>(part, block, to_bfloat16));
-        break;
-      case Dtype::kF64:
-        append(name, convert_block<double>(part, block, [](float x) { return double{x}; }));
-        break;
-      default:
-        fail(ErrorKind::kMismatch, "safetensors: ", in_quotes(name), " holds ", dtype_name(dtype),
-             ", but floating-point values are written");
+    if (dtype == Dtype::kF32) {
+      append(name, std::as_bytes(part));
+      continue;
     }
+    block.resize(part.size() * static_cast<std::size_t>(dtype_size(dtype)));
+    from_float32(dtype, part, block);
+    append(name, block);
   }
   skip_complete();
 }

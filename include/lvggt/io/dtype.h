@@ -1,7 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <cstddef>
 #include <cstdint>
+#include <span>
 #include <string_view>
 
 namespace lvggt {
@@ -68,5 +70,12 @@ constexpr bool dtype_is_float(Dtype dtype) {
   return dtype == Dtype::kF32 || dtype == Dtype::kF16 || dtype == Dtype::kBF16 ||
          dtype == Dtype::kF64;
 }
+
+// Widens stored floating-point values (F32, F16, BF16; F64 is rounded); other types are a kMismatch
+// Error. bytes.size() is out.size() elements; they need not be aligned.
+void to_float32(Dtype dtype, std::span<const std::byte> bytes, std::span<float> out);
+
+// The other way, rounding to nearest even; beyond the largest F16 value becomes infinity.
+void from_float32(Dtype dtype, std::span<const float> values, std::span<std::byte> out);
 
 }  // namespace lvggt
