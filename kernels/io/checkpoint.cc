@@ -88,6 +88,12 @@ Checkpoint::Checkpoint(const LoadOptions& options)
   has_decoder_ = decoder_.has_value() || any_name(geometry_, decoder_name);
   has_point_head_ = options.points && any_name(geometry_, point_head_name);
   settle_config(options);
+  if (overrides_ && has_decoder_) {
+    const TensorEntry* last = overrides_->find("weight." + language_decoder_names(config_).front() +
+                                               ".final_conv.weight");
+    if (last != nullptr && last->shape.size() == 4 && last->shape[0] > 0)
+      config_.lang_dim = last->shape[0];
+  }
 
   const std::vector<TensorSpec> expected = expected_tensors();
   Problems problems;

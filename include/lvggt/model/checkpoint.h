@@ -23,7 +23,8 @@ struct LoadOptions {
   std::string config =
       {};  // JSON configuration; empty: the metadata's "config", else what the shapes tell
   std::string overrides =
-      {};  // safetensors whose tensors weight.NAME take the place of NAME; may be empty
+      {};  // safetensors whose tensors weight.NAME take the place of NAME and
+                               // may change lang_dim; may be empty
   bool strict = false;  // tensors that the configuration does not name are an error, not a warning
   bool allow_nonfinite = false;  // accept NaN and infinity in weights
   bool points = true;            // load the point head, if it is there

@@ -17,28 +17,37 @@ namespace lvggt {
 // thread where blocks are read in parallel). `prefix` is the module's name in the checkpoint,
 // without a final dot.
 
-inline Linear load_linear(const Checkpoint& c, const std::string& prefix) {
-  return {pack_linear(c.read<2>(prefix + ".weight")), c.read<1>(prefix + ".bias")};
+template <class Source>
+Linear load_linear(const Source& c, const std::string& prefix) {
+  return {pack_linear(c.template read<2>(prefix + ".weight")),
+          c.template read<1>(prefix + ".bias")};
 }
 
-inline LayerNorm load_layer_norm(const Checkpoint& c, const std::string& prefix, double eps) {
-  return {c.read<1>(prefix + ".weight"), c.read<1>(prefix + ".bias"), static_cast<float>(eps)};
+template <class Source>
+LayerNorm load_layer_norm(const Source& c, const std::string& prefix, double eps) {
+  return {c.template read<1>(prefix + ".weight"), c.template read<1>(prefix + ".bias"),
+          static_cast<float>(eps)};
 }
 
-inline Conv2d load_conv2d(const Checkpoint& c, const std::string& prefix, std::int64_t stride,
-                          std::int64_t padding) {
-  return {pack_conv2d(c.read<4>(prefix + ".weight"), stride, padding), c.read<1>(prefix + ".bias")};
+template <class Source>
+Conv2d load_conv2d(const Source& c, const std::string& prefix, std::int64_t stride,
+                   std::int64_t padding) {
+  return {pack_conv2d(c.template read<4>(prefix + ".weight"), stride, padding),
+          c.template read<1>(prefix + ".bias")};
 }
 
-inline ConvTranspose2d load_conv_transpose2d(const Checkpoint& c, const std::string& prefix) {
-  return {pack_conv_transpose2d(c.read<4>(prefix + ".weight")), c.read<1>(prefix + ".bias")};
+template <class Source>
+ConvTranspose2d load_conv_transpose2d(const Source& c, const std::string& prefix) {
+  return {pack_conv_transpose2d(c.template read<4>(prefix + ".weight")),
+          c.template read<1>(prefix + ".bias")};
 }
 
 // A 1x1 convolution as a linear layer over pixels.
-inline Linear load_pixel_linear(const Checkpoint& c, const std::string& prefix) {
-  const Tensor<float, 4> weight = c.read<4>(prefix + ".weight");
+template <class Source>
+Linear load_pixel_linear(const Source& c, const std::string& prefix) {
+  const Tensor<float, 4> weight = c.template read<4>(prefix + ".weight");
   const Shape<2> shape{weight.extent(0), weight.extent(1)};
-  return {pack_linear(weight.view().reshaped(shape)), c.read<1>(prefix + ".bias")};
+  return {pack_linear(weight.view().reshaped(shape)), c.template read<1>(prefix + ".bias")};
 }
 
 // A convolution with the batch norm that follows it folded in.
@@ -57,8 +66,9 @@ inline DoubleConv load_double_conv(const Checkpoint& c, const std::string& prefi
           load_normed_conv2d(c, prefix + ".3", prefix + ".4", eps)};
 }
 
-inline Block load_block(const Checkpoint& c, const std::string& prefix, std::int64_t num_heads,
-                        bool qk_norm, double eps) {
+template <class Source>
+Block load_block(const Source& c, const std::string& prefix, std::int64_t num_heads, bool qk_norm,
+                 double eps) {
   Block block;
   block.norm1 = load_layer_norm(c, prefix + ".norm1", eps);
   block.attn.qkv = load_linear(c, prefix + ".attn.qkv");
@@ -68,10 +78,10 @@ inline Block load_block(const Checkpoint& c, const std::string& prefix, std::int
   }
   block.attn.proj = load_linear(c, prefix + ".attn.proj");
   block.attn.num_heads = num_heads;
-  block.ls1 = c.read<1>(prefix + ".ls1.gamma");
+  block.ls1 = c.template read<1>(prefix + ".ls1.gamma");
   block.norm2 = load_layer_norm(c, prefix + ".norm2", eps);
   block.mlp = {load_linear(c, prefix + ".mlp.fc1"), load_linear(c, prefix + ".mlp.fc2")};
-  block.ls2 = c.read<1>(prefix + ".ls2.gamma");
+  block.ls2 = c.template read<1>(prefix + ".ls2.gamma");
   return block;
 }
 
@@ -146,8 +156,8 @@ inline CameraHead load_camera_head(const Checkpoint& c, Context& ctx) {
   return head;
 }
 
-inline FusionBlock load_fusion_block(const Checkpoint& c, const std::string& prefix,
-                                     bool with_skip) {
+template <class Source>
+FusionBlock load_fusion_block(const Source& c, const std::string& prefix, bool with_skip) {
   const auto unit = [&](const std::string& name) {
     return ResidualConvUnit{load_conv2d(c, prefix + name + ".conv1", 1, 1),
                             load_conv2d(c, prefix + name + ".conv2", 1, 1)};

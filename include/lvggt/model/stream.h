@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <limits>
 #include <memory>
 #include <optional>
 #include <string>
@@ -177,6 +178,10 @@ class Stream {
     try {
       frame.camera = decode_pose_encoding(frame.pose_encoding, b.geometry.H, b.geometry.W);
     } catch (const Error& e) {
+      if (options_.allow_degenerate_camera) {
+        frame.camera.fx = frame.camera.fy = std::numeric_limits<float>::quiet_NaN();
+        return;
+      }
       fail(e.kind(), "frame ", num_frames_, ": ", e.what());
     }
   }

@@ -13,6 +13,9 @@ enum class CameraCache {
 struct StreamOptions {
   std::int64_t max_past_frames = 128;  // frames kept in the caches after each push; at least 1
   CameraCache camera_cache = CameraCache::kStream;
+  // Give a camera whose pose encoding cannot be decoded (a field of view of 0, say) focal lengths
+  // of NaN, instead of failing: for looking at a model, not for using what it says.
+  bool allow_degenerate_camera = false;
   bool points = false;              // run the point head
   bool rgb = true;                  // run the RGB head, if the decoder has one
   bool decoder = true;              // run the decoder, if there is one

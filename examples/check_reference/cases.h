@@ -1,0 +1,24 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "examples/check_reference/comparison.h"
+
+namespace check_reference {
+
+// Each runs the model or the operators on the inputs of the comparison's file and compares every
+// tensor it can compute.
+
+// stream, stream_lang6, evict, full_size: frames one at a time with the cache.
+void check_stream(Comparison& comparison, const lvggt::LoadOptions& load, lvggt::Context& ctx);
+
+// batch, square (causal) and vggt (bidirectional): all frames at once.
+void check_clip(Comparison& comparison, const lvggt::LoadOptions& load, lvggt::BatchMode mode,
+                lvggt::Context& ctx);
+
+// ops: single operators; what only training needs is skipped.
+void check_ops(Comparison& comparison, lvggt::Context& ctx);
+
+// preprocess: image loading.
+void check_preprocess(Comparison& comparison);
+
+}  // namespace check_reference

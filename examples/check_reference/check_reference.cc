@@ -1,0 +1,101 @@
+// SPDX-License-Identifier: Apache-2.0
+// Runs the case that a reference file names and compares every tensor in it with ours.
+#include <cstdio>
+#include <string>
+
+#include "examples/check_reference/cases.h"
+#include "lvggt/cli/program.h"
+
+namespace {
+
+using namespace lvggt;
+
+struct Options {
+  LoadOptions load;
+  std::string case_file;
+  double tolerance = 2e-4;
+  int threads = 0;
+  bool json = false;
+};
+
+std::string case_of(const Safetensors& file) {
+  const auto found = file.metadata().find("case");
+  if (found == file.metadata().end())
+    fail(ErrorKind::kFormat, file.path(), ": its metadata has no \"case\" that says what it is a ",
+         "reference for");
+  return found->second;
+}
+
+void run_case(const std::string& name, check_reference::Comparison& comparison,
+              const Options& options, Context& ctx) {
+  if (name == "ops") return check_reference::check_ops(comparison, ctx);
+  if (name == "preprocess") return check_reference::check_preprocess(comparison);
+  const bool streamed = name.starts_with("stream") || name == "evict" || name == "full_size";
+  const bool bidirectional = name == "vggt";
+  if (!streamed && !bidirectional && name != "batch" && name != "square")
+    fail(ErrorKind::kUnsupported, comparison.file().path(), ": case \"", name,
+         "\" is not one of stream, ",
+         "stream_lang6, evict, batch, square, vggt, ops, preprocess, full_size");
+  if (options.load.weights.empty())
+    fail(ErrorKind::kUsage, "--weights is required for the case \"", name, "\"");
+  if (streamed) {
+    check_reference::check_stream(comparison, options.load, ctx);
+  } else {
+    check_reference::check_clip(comparison, options.load,
+                                bidirectional ? BatchMode::kBidirectional : BatchMode::kCausal,
+                                ctx);
+  }
+}
+
+int check(const Options& options) {
+  const Safetensors file = Safetensors::open(options.case_file);
+  const std::string name = case_of(file);
+  if (name.starts_with("train") || name == "autoencoder") {
+    std::fprintf(
+        stderr,
+        "check_reference: %s: the case \"%s\" is about training, which is not supported yet\n",
+        file.path().c_str(), name.c_str());
+    return 1;
+  }
+  Context ctx(options.threads);
+  check_reference::Comparison comparison(file, options.tolerance);
+  run_case(name, comparison, options, ctx);
+  comparison.finish();
+  const std::string report = options.json ? comparison.json(name) : comparison.text();
+  if (std::fwrite(report.data(), 1, report.size(), stdout) != report.size() ||
+      std::fflush(stdout) != 0)
+    fail(ErrorKind::kWrite, "standard output: cannot be written");
+  return comparison.ok() ? 0 : 1;
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  Options options;
+  cli::Program program(
+      "check_reference",
+      "Compares the engine with reference values: runs the case that CASE names in its "
+      "metadata and prints one line a tensor, `name  max_abs_err  rel_err  ok|FAIL`, where "
+      "rel_err = max|ours - ref| / max|ref|.",
+      LVGGT_VERSION);
+  auto& app = program.app();
+  app.add_option("case", options.case_file, "Reference file (safetensors)")
+      ->required()
+      ->type_name("CASE");
+  app.add_option("--weights", options.load.weights, "Geometry weights, maybe with the decoder's")
+      ->type_name("FILE");
+  app.add_option("--decoder", options.load.decoder,
+                 "Decoder weights, if they are in a file of their own")
+      ->type_name("FILE");
+  app.add_option("--config", options.load.config,
+                 "Configuration (JSON); else the weights' metadata or shapes tell it")
+      ->type_name("FILE");
+  program.add_number("--tolerance", options.tolerance, "Largest rel_err that passes", 0.0, 1e9);
+  program.add_number("--threads", options.threads, "Threads; 0: all this process may use", 0,
+                     kMaxThreads);
+  app.add_flag("--json", options.json, "Print one JSON object instead of lines");
+  app.footer(
+      "Exit status: 0 all within the tolerance, 1 some are not, 2 wrong usage, 3 bad input file, 4 "
+      "memory.");
+  return program.run(argc, argv, [&] { return check(options); });
+}
