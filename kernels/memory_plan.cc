@@ -35,8 +35,8 @@ double packed_size(const TensorSpec& spec) {
 }
 
 double group_size(std::int64_t heads, std::int64_t tokens, std::int64_t head_dim) {
-  return static_cast<double>(packed_keys_size(heads, tokens, head_dim) +
-                             packed_values_size(heads, tokens, head_dim));
+  return static_cast<double>(keys_values_layout(Storage::kF32, heads, tokens, head_dim).size) /
+         sizeof(float);
 }
 
 // One size of frame, in the letters of the model.
