@@ -23,19 +23,22 @@ bool transposed_conv(std::string_view name) {
   return false;
 }
 
-// Floats of one tensor once packed. Batch norms are folded away.
-double packed_size(const TensorSpec& spec) {
+// Floats that one tensor takes once packed; the scales of int8 are one for a whole row, nothing
+// beside it. Batch norms are folded away.
+double packed_size(const TensorSpec& spec, const StoragePolicy& policy) {
   const auto& s = spec.shape;
   if (known_unused_tensor(spec.name)) return 0;
   if (spec.name.ends_with(".running_mean") || spec.name.ends_with(".running_var")) return 0;
   if (!spec.name.ends_with(".weight") || s.size() < 2) return static_cast<double>(spec.volume());
   const std::size_t out_axis = transposed_conv(spec.name) ? 1 : 0;
+  const Storage storage = s.size() == 2 ? policy.linear(spec.name) : policy.conv(spec.name);
   return static_cast<double>(spec.volume()) / static_cast<double>(s[out_axis]) *
-         padded(s[out_axis]);
+         padded(s[out_axis]) * static_cast<double>(storage_bytes(storage)) / sizeof(float);
 }
 
-double group_size(std::int64_t heads, std::int64_t tokens, std::int64_t head_dim) {
-  return static_cast<double>(keys_values_layout(Storage::kF32, heads, tokens, head_dim).size) /
+double group_size(std::int64_t heads, std::int64_t tokens, std::int64_t head_dim,
+                  Storage storage = Storage::kF32) {
+  return static_cast<double>(keys_values_layout(storage, heads, tokens, head_dim).size) /
          sizeof(float);
 }
 
@@ -92,7 +95,7 @@ double output_floats(const Frame& f, const ModelConfig& c, const StreamOptions& 
 }  // namespace
 
 MemoryPlan plan_memory(const ModelConfig& c, std::int64_t H, std::int64_t W,
-                       const StreamOptions& options) {
+                       const StreamOptions& options, const StoragePolicy& storage) {
   LVGGT_CHECK(H > 0 && W > 0 && H <= kMaxSide && W <= kMaxSide, "plan_memory: a frame of ", W,
               " x ", H, " pixels does not lie in [1, ", kMaxSide, "]");
   const std::int64_t patches = (H / c.patch_size) * (W / c.patch_size);
@@ -102,12 +105,14 @@ MemoryPlan plan_memory(const ModelConfig& c, std::int64_t H, std::int64_t W,
 
   double weights = 0;
   for (const TensorSpec& spec : geometry_tensors(c))
-    if (options.points || !spec.name.starts_with("point_head.")) weights += packed_size(spec);
+    if (options.points || !spec.name.starts_with("point_head."))
+      weights += packed_size(spec, storage);
   if (options.decoder)
-    for (const TensorSpec& spec : decoder_tensors(c)) weights += packed_size(spec);
+    for (const TensorSpec& spec : decoder_tensors(c)) weights += packed_size(spec, storage);
 
   double cache_per_frame =
-      static_cast<double>(c.agg_depth) * group_size(c.agg_heads, P, c.embed_dim / c.agg_heads);
+      static_cast<double>(c.agg_depth) *
+      group_size(c.agg_heads, P, c.embed_dim / c.agg_heads, options.cache_storage);
   if (options.camera_cache == CameraCache::kStream)
     cache_per_frame += static_cast<double>(c.cam_trunk_depth) *
                        group_size(c.cam_heads, c.cam_iterations, 2 * c.embed_dim / c.cam_heads);

@@ -9,7 +9,8 @@ namespace check_reference {
 // tensor it can compute.
 
 // stream, stream_lang6, evict, full_size: frames one at a time with the cache.
-void check_stream(Comparison& comparison, const lvggt::LoadOptions& load, lvggt::Context& ctx);
+void check_stream(Comparison& comparison, const lvggt::LoadOptions& load,
+                  lvggt::Storage cache_storage, lvggt::Context& ctx);
 
 // batch, square (causal) and vggt (bidirectional): all frames at once.
 void check_clip(Comparison& comparison, const lvggt::LoadOptions& load, lvggt::BatchMode mode,

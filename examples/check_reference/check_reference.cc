@@ -13,6 +13,7 @@ using namespace lvggt;
 struct Options {
   LoadOptions load;
   std::string case_file;
+  std::string weights_storage = "f32", cache_storage = "f32";
   double tolerance = 2e-4;
   int threads = 0;
   bool json = false;
@@ -38,12 +39,14 @@ void run_case(const std::string& name, check_reference::Comparison& comparison,
          "stream_lang6, evict, batch, square, vggt, ops, preprocess, full_size");
   if (options.load.weights.empty())
     fail(ErrorKind::kUsage, "--weights is required for the case \"", name, "\"");
+  LoadOptions load = options.load;
+  load.storage = StoragePolicy::of(parse_storage(options.weights_storage, "--weights-storage"));
   if (streamed) {
-    check_reference::check_stream(comparison, options.load, ctx);
+    check_reference::check_stream(comparison, load,
+                                  parse_storage(options.cache_storage, "--cache-storage"), ctx);
   } else {
-    check_reference::check_clip(comparison, options.load,
-                                bidirectional ? BatchMode::kBidirectional : BatchMode::kCausal,
-                                ctx);
+    check_reference::check_clip(
+        comparison, load, bidirectional ? BatchMode::kBidirectional : BatchMode::kCausal, ctx);
   }
 }
 
@@ -90,6 +93,14 @@ int main(int argc, char** argv) {
   app.add_option("--config", options.load.config,
                  "Configuration (JSON); else the weights' metadata or shapes tell it")
       ->type_name("FILE");
+  app.add_option("--weights-storage", options.weights_storage,
+                 "How weights are kept: f32, bf16, f16 or int8 (linear layers of the transformer)")
+      ->type_name("TYPE")
+      ->capture_default_str();
+  app.add_option("--cache-storage", options.cache_storage,
+                 "How cached keys and values are kept: f32, bf16 or int8")
+      ->type_name("TYPE")
+      ->capture_default_str();
   program.add_number("--tolerance", options.tolerance, "Largest rel_err that passes", 0.0, 1e9);
   program.add_number("--threads", options.threads, "Threads; 0: all this process may use", 0,
                      kMaxThreads);

@@ -88,7 +88,7 @@ void Comparison::compare(const std::string& name, const std::vector<std::int64_t
                           std::to_string(expected.size()));
     return;
   }
-  Line line{name, 0, 0, Verdict::kOk, {}};
+  Line line{name, 0, 0, 0, Verdict::kOk, {}};
   double largest = 0;
   for (std::size_t i = 0; i < values.size(); ++i) {
     line.max_abs_err =
@@ -103,8 +103,8 @@ void Comparison::compare(const std::string& name, const std::vector<std::int64_t
 
 void Comparison::judge(const std::string& name, std::span<const float> ours,
                        std::span<const float> expected) {
-  Line line{name, 0, 0, Verdict::kOk, {}};
-  double largest = 0;
+  Line line{name, 0, 0, 0, Verdict::kOk, {}};
+  double largest = 0, squared_error = 0, squared_norm = 0;
   for (std::size_t i = 0; i < ours.size(); ++i) {
     const double a = ours[i], b = expected[i];
     // Equal infinities differ by nothing; a NaN differs from everything.
@@ -113,7 +113,10 @@ void Comparison::judge(const std::string& name, std::span<const float> ours,
                        : std::isnan(error)       ? kInfinity
                                                  : error;
     if (std::isfinite(b)) largest = std::max(largest, std::abs(b));
+    squared_error += error * error;
+    squared_norm += b * b;
   }
+  if (squared_error > 0) line.rel_l2 = std::sqrt(squared_error / squared_norm);
   if (line.max_abs_err > 0) line.rel_err = largest > 0 ? line.max_abs_err / largest : kInfinity;
   if (!(line.rel_err <= tolerance_)) line.verdict = Verdict::kFail;
   ok_ = ok_ && line.verdict == Verdict::kOk;
@@ -121,20 +124,20 @@ void Comparison::judge(const std::string& name, std::span<const float> ours,
 }
 
 void Comparison::add_failure(const std::string& name, const std::string& note) {
-  lines_.push_back({name, kInfinity, kInfinity, Verdict::kFail, note});
+  lines_.push_back({name, kInfinity, kInfinity, kInfinity, Verdict::kFail, note});
   ok_ = false;
 }
 
 void Comparison::skip(const std::string& name) {
   if (!wants(name) || !seen_.insert(name).second) return;
-  lines_.push_back({name, 0, 0, Verdict::kSkipped, "part of training"});
+  lines_.push_back({name, 0, 0, 0, Verdict::kSkipped, "part of training"});
 }
 
 void Comparison::finish() {
   for (const lvggt::TensorEntry& entry : file_.entries()) {
     const std::string& name = entry.name;
     if (seen_.contains(name) || name.starts_with("weight.") || name.ends_with(".noise")) continue;
-    lines_.push_back({name, 0, 0, Verdict::kNotChecked, "nothing was computed for it"});
+    lines_.push_back({name, 0, 0, 0, Verdict::kNotChecked, "nothing was computed for it"});
     ok_ = false;
   }
 }
@@ -189,6 +192,7 @@ std::string Comparison::json(const std::string& case_name) const {
     out.field("name", line.name);
     number("max_abs_err", line.verdict == Verdict::kNotChecked ? kInfinity : line.max_abs_err);
     number("rel_err", line.verdict == Verdict::kNotChecked ? kInfinity : line.rel_err);
+    number("rel_l2", line.verdict == Verdict::kNotChecked ? kInfinity : line.rel_l2);
     out.field("ok", line.verdict == Verdict::kOk);
     if (!line.note.empty()) out.field("note", line.note);
     out.end_object();

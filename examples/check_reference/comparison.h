@@ -49,6 +49,7 @@ class Comparison {
   struct Line {
     std::string name;
     double max_abs_err = 0, rel_err = 0;
+    double rel_l2 = 0;  // |ours - ref| / |ref|, Euclidean norms
     Verdict verdict = Verdict::kOk;
     std::string note;  // why it failed, when the numbers do not say
   };

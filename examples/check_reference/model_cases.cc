@@ -160,7 +160,8 @@ LoadOptions with_overrides(LoadOptions load, const Safetensors& file) {
 
 }  // namespace
 
-void check_stream(Comparison& comparison, const LoadOptions& load, Context& ctx) {
+void check_stream(Comparison& comparison, const LoadOptions& load, Storage cache_storage,
+                  Context& ctx) {
   const Safetensors& file = comparison.file();
   const LangVggt model = LangVggt::load(with_overrides(load, file), ctx);
   const Tensor<float, 4> images = input_frames(comparison, ctx);
@@ -171,7 +172,9 @@ void check_stream(Comparison& comparison, const LoadOptions& load, Context& ctx)
               images[s], ctx);
   comparison.compare("images", planes);
 
-  StreamOptions options{.allow_degenerate_camera = true, .points = model.has_point_head()};
+  StreamOptions options{.cache_storage = cache_storage,
+                        .allow_degenerate_camera = true,
+                        .points = model.has_point_head()};
   if (comparison.wants("max_num")) {
     options.max_past_frames = file.read_int64("max_num").at(0);
     comparison.accept("max_num");

@@ -80,6 +80,7 @@ struct Checkpoint::Problems {
 
 Checkpoint::Checkpoint(const LoadOptions& options)
     : geometry_(Safetensors::open(options.weights)),
+      storage_(options.storage),
       skip_points_(!options.points),
       allow_nonfinite_(options.allow_nonfinite) {
   if (!options.decoder.empty()) decoder_ = Safetensors::open(options.decoder);

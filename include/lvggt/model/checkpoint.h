@@ -10,6 +10,7 @@
 
 #include "lvggt/io/safetensors.h"
 #include "lvggt/model/config.h"
+#include "lvggt/model/storage_policy.h"
 #include "lvggt/model/tensor_list.h"
 
 namespace lvggt {
@@ -22,12 +23,12 @@ struct LoadOptions {
   std::string decoder = {};  // safetensors with the decoder tensors; may be empty
   std::string config =
       {};  // JSON configuration; empty: the metadata's "config", else what the shapes tell
-  std::string overrides =
-      {};  // safetensors whose tensors weight.NAME take the place of NAME and
+  std::string overrides = {};  // safetensors whose tensors weight.NAME take the place of NAME and
                                // may change lang_dim; may be empty
   bool strict = false;  // tensors that the configuration does not name are an error, not a warning
   bool allow_nonfinite = false;  // accept NaN and infinity in weights
   bool points = true;            // load the point head, if it is there
+  StoragePolicy storage = {};    // how the packed weights are kept in memory
 };
 
 // What the names and shapes of the tensors tell of the configuration, and `base` for the rest. In
@@ -51,6 +52,7 @@ class Checkpoint {
   explicit Checkpoint(const LoadOptions& options);
 
   const ModelConfig& config() const { return config_; }
+  const StoragePolicy& storage() const { return storage_; }
   bool has_decoder() const { return has_decoder_; }
   bool has_point_head() const { return has_point_head_; }
 
@@ -99,6 +101,7 @@ class Checkpoint {
   std::optional<Safetensors> decoder_;
   std::optional<Safetensors> overrides_;
   ModelConfig config_;
+  StoragePolicy storage_;
   bool has_decoder_ = false;
   bool has_point_head_ = false;
   bool skip_points_ = false;

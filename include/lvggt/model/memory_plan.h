@@ -4,6 +4,7 @@
 #include <cstddef>
 
 #include "lvggt/model/config.h"
+#include "lvggt/model/storage_policy.h"
 #include "lvggt/model/stream_options.h"
 
 namespace lvggt {
@@ -18,6 +19,6 @@ struct MemoryPlan {
 
 // What is needed without loading anything; within about a tenth of the measured memory.
 MemoryPlan plan_memory(const ModelConfig& config, std::int64_t H, std::int64_t W,
-                       const StreamOptions& options = {});
+                       const StreamOptions& options = {}, const StoragePolicy& storage = {});
 
 }  // namespace lvggt

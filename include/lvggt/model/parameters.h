@@ -17,9 +17,13 @@ namespace lvggt {
 // thread where blocks are read in parallel). `prefix` is the module's name in the checkpoint,
 // without a final dot.
 
+// A plain file is kept as float32.
+inline const StoragePolicy& storage_policy(const Checkpoint& c) { return c.storage(); }
+inline StoragePolicy storage_policy(const Safetensors&) { return {}; }
+
 template <class Source>
 Linear load_linear(const Source& c, const std::string& prefix) {
-  return {pack_linear(c.template read<2>(prefix + ".weight")),
+  return {pack_linear(c.template read<2>(prefix + ".weight"), storage_policy(c).linear(prefix)),
           c.template read<1>(prefix + ".bias")};
 }
 
@@ -32,14 +36,16 @@ LayerNorm load_layer_norm(const Source& c, const std::string& prefix, double eps
 template <class Source>
 Conv2d load_conv2d(const Source& c, const std::string& prefix, std::int64_t stride,
                    std::int64_t padding) {
-  return {pack_conv2d(c.template read<4>(prefix + ".weight"), stride, padding),
+  return {pack_conv2d(c.template read<4>(prefix + ".weight"), stride, padding,
+                      storage_policy(c).conv(prefix)),
           c.template read<1>(prefix + ".bias")};
 }
 
 template <class Source>
 ConvTranspose2d load_conv_transpose2d(const Source& c, const std::string& prefix) {
-  return {pack_conv_transpose2d(c.template read<4>(prefix + ".weight")),
-          c.template read<1>(prefix + ".bias")};
+  return {
+      pack_conv_transpose2d(c.template read<4>(prefix + ".weight"), storage_policy(c).conv(prefix)),
+      c.template read<1>(prefix + ".bias")};
 }
 
 // A 1x1 convolution as a linear layer over pixels.
@@ -47,7 +53,8 @@ template <class Source>
 Linear load_pixel_linear(const Source& c, const std::string& prefix) {
   const Tensor<float, 4> weight = c.template read<4>(prefix + ".weight");
   const Shape<2> shape{weight.extent(0), weight.extent(1)};
-  return {pack_linear(weight.view().reshaped(shape)), c.template read<1>(prefix + ".bias")};
+  return {pack_linear(weight.view().reshaped(shape), storage_policy(c).conv(prefix)),
+          c.template read<1>(prefix + ".bias")};
 }
 
 // A convolution with the batch norm that follows it folded in.
@@ -58,7 +65,7 @@ inline Conv2d load_normed_conv2d(const Checkpoint& c, const std::string& conv,
   batch_norm2d_fold(weight, bias, c.read<1>(norm + ".weight"), c.read<1>(norm + ".bias"),
                     c.read<1>(norm + ".running_mean"), c.read<1>(norm + ".running_var"),
                     static_cast<float>(eps));
-  return {pack_conv2d(weight, 1, 1), std::move(bias)};
+  return {pack_conv2d(weight, 1, 1, storage_policy(c).conv(conv)), std::move(bias)};
 }
 
 inline DoubleConv load_double_conv(const Checkpoint& c, const std::string& prefix, double eps) {
@@ -184,7 +191,8 @@ inline DptHead load_dpt_head(const Checkpoint& c, const std::string& prefix, boo
     const std::string number = std::to_string(i + 1);
     reassemble.projects[i] = load_pixel_linear(c, prefix + ".projects." + std::to_string(i));
     reassemble.layer_rn[i].weight =
-        pack_conv2d(c.read<4>(scratch + ".layer" + number + "_rn.weight"), 1, 1);
+        pack_conv2d(c.read<4>(scratch + ".layer" + number + "_rn.weight"), 1, 1,
+                    storage_policy(c).conv(scratch));
     head.refinenet[i] = load_fusion_block(c, scratch + ".refinenet" + number, i < 3);
   }
   head.output_conv1 = load_conv2d(c, scratch + ".output_conv1", 1, 1);

@@ -82,6 +82,9 @@ class Stream {
     if (options_.max_past_frames < 1 || options_.max_past_frames > kMaxPastFrames)
       fail(ErrorKind::kUsage, "stream: the number of past frames must lie in [1, ", kMaxPastFrames,
            "], not ", options_.max_past_frames);
+    if (options_.cache_storage == Storage::kF16)
+      fail(ErrorKind::kUsage,
+           "stream: cached keys and values are kept as f32, bf16 or int8, not f16");
     if (bad_side(options_.decoder_height) || bad_side(options_.decoder_width) ||
         (options_.decoder_height == 0) != (options_.decoder_width == 0))
       fail(ErrorKind::kUsage, "stream: the decoder's output size must lie in [1, ", kMaxSide,
@@ -104,7 +107,7 @@ class Stream {
     auto b = std::unique_ptr<Buffers>(new Buffers{
         .geometry = std::move(geometry),
         .tokens = KvCache(c.agg_depth, c.agg_heads, c.embed_dim / c.agg_heads, P,
-                          options_.max_past_frames),
+                          options_.max_past_frames, options_.cache_storage),
         .camera_entries = KvCache(c.cam_trunk_depth, c.cam_heads, cam_head_dim, c.cam_iterations,
                                   options_.max_past_frames),
         .camera_iterations = {Tensor<float, 4>(camera_shape()), Tensor<float, 4>(camera_shape())},
