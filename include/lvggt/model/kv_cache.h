@@ -1,11 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <span>
 
 #include "lvggt/core/reserved_memory.h"
 #include "lvggt/kernels/attention.h"
+#include "lvggt/model/window_policy.h"
 
 namespace lvggt {
 
@@ -13,24 +15,25 @@ namespace lvggt {
 inline constexpr std::int64_t kMaxPastFrames = std::int64_t{1} << 24;
 
 // Keys and values of past frames, for every layer, packed for the attention kernel when they are
-// made. The frames are a ring over address space reserved up front: memory is committed as the
-// first max_past_frames + 1 frames arrive, and nothing is allocated after construction.
+// made. Each frame has a slot in address space reserved up front: memory is committed as the first
+// max_past_frames + 1 frames arrive, and nothing is allocated after construction.
 //
 // The running frame is what append() is given until end_frame(): it sees the cached frames and its
-// own tokens, so at most max_past_frames + 1 frames. end_frame() keeps it and then evicts the
-// oldest frames while more than max_past_frames are cached. A frame that is never ended leaves no
-// trace: the next one overwrites it.
+// own tokens, so at most max_past_frames + 1 frames. end_frame() keeps it and then, while more than
+// max_past_frames are cached, evicts the frame that the policy names: by default the oldest. A
+// frame that is never ended leaves no trace: the next one overwrites it.
 class KvCache {
  public:
   KvCache(std::int64_t num_layers, std::int64_t num_heads, std::int64_t head_dim,
           std::int64_t tokens_per_frame, std::int64_t max_past_frames,
-          Storage storage = Storage::kF32)
+          Storage storage = Storage::kF32, const WindowPolicy& policy = {})
       : num_layers_(num_layers),
         num_heads_(num_heads),
         head_dim_(head_dim),
         tokens_per_frame_(tokens_per_frame),
         max_past_frames_(max_past_frames),
         storage_(storage),
+        policy_(policy),
         group_bytes_(keys_values_layout(storage, num_heads, tokens_per_frame, head_dim).size) {
     if (max_past_frames < 1 || max_past_frames > kMaxPastFrames)
       fail(ErrorKind::kUsage, "kv_cache: the number of past frames must lie in [1, ",
@@ -40,6 +43,9 @@ class KvCache {
     if (total > 1e14)  // beyond the 47 bits of address space that a process has
       fail(ErrorKind::kMemory, "kv_cache: ", max_past_frames, " past frames would take ", total,
            " bytes; a smaller window fits");
+    policy.check();
+    frames_ = ReservedMemory(static_cast<std::size_t>(capacity()) * sizeof(std::int64_t));
+    slots_ = ReservedMemory(static_cast<std::size_t>(capacity()) * sizeof(std::int64_t));
     groups_ = ReservedMemory(static_cast<std::size_t>(capacity()) * sizeof(PackedKeysValues));
     packed_ = ReservedMemory(static_cast<std::size_t>(capacity() * num_layers * group_bytes_));
   }
@@ -62,16 +68,17 @@ class KvCache {
   }
 
   void end_frame() {
-    ++num_frames_;
-    while (num_frames_ > max_past_frames_) evict_oldest();
-  }
-
-  void evict_oldest() {
-    oldest_ = (oldest_ + 1) % capacity();
-    --num_frames_;
+    frames()[num_frames_++] = frames_seen_++;
+    std::int64_t free_slot = num_frames_;  // not used yet, while the window fills
+    while (num_frames_ > max_past_frames_) free_slot = evict();
+    slots()[num_frames_] = free_slot;
   }
 
   std::int64_t num_frames() const { return num_frames_; }  // cached, without the running one
+  // Their numbers in the stream, oldest first; valid until the next frame ends.
+  std::span<const std::int64_t> cached_frames() const {
+    return {frames(), static_cast<std::size_t>(num_frames_)};
+  }
 
   // Bytes of a full cache.
   std::size_t max_bytes() const { return packed_.num_bytes(); }
@@ -79,21 +86,37 @@ class KvCache {
  private:
   std::int64_t capacity() const { return max_past_frames_ + 1; }
 
+  // Of the cached frames, oldest first, and of the running one: the number in the stream, the slot.
+  std::int64_t* frames() const { return reinterpret_cast<std::int64_t*>(frames_.data()); }
+  std::int64_t* slots() const { return reinterpret_cast<std::int64_t*>(slots_.data()); }
+
+  // Forgets one frame; returns its slot.
+  std::int64_t evict() {
+    const std::int64_t idx = policy_.evicted({frames(), static_cast<std::size_t>(num_frames_)});
+    const std::int64_t slot = slots()[idx];
+    std::copy(frames() + idx + 1, frames() + num_frames_, frames() + idx);
+    std::copy(slots() + idx + 1, slots() + num_frames_, slots() + idx);
+    --num_frames_;
+    return slot;
+  }
+
   // Frame `idx` counted from the oldest; idx == num_frames() is the running one. The layers of a
   // frame lie side by side, so that memory is committed frame by frame.
   PackedKeysValues group(std::int64_t idx, std::int64_t layer) const {
-    const std::int64_t slot = (oldest_ + idx) % capacity();
     const std::int64_t tokens = idx == num_frames_ ? running_tokens_ : tokens_per_frame_;
-    return {packed_.data() + (slot * num_layers_ + layer) * group_bytes_, storage_, num_heads_,
-            tokens, head_dim_};
+    return {packed_.data() + (slots()[idx] * num_layers_ + layer) * group_bytes_, storage_,
+            num_heads_, tokens, head_dim_};
   }
 
   std::int64_t num_layers_, num_heads_, head_dim_, tokens_per_frame_, max_past_frames_;
   Storage storage_;
+  WindowPolicy policy_;
   std::int64_t group_bytes_;  // of one frame in one layer
-  std::int64_t oldest_ = 0;   // slot
   std::int64_t num_frames_ = 0;
+  std::int64_t frames_seen_ = 0;  // ended, cached or not
   std::int64_t running_tokens_ = 0;
+  ReservedMemory frames_;  // int64 [capacity]
+  ReservedMemory slots_;   // int64 [capacity]
   ReservedMemory groups_;  // PackedKeysValues [capacity]
   ReservedMemory packed_;  // [capacity, layers, group_bytes_]
 };

@@ -107,9 +107,9 @@ class Stream {
     auto b = std::unique_ptr<Buffers>(new Buffers{
         .geometry = std::move(geometry),
         .tokens = KvCache(c.agg_depth, c.agg_heads, c.embed_dim / c.agg_heads, P,
-                          options_.max_past_frames, options_.cache_storage),
+                          options_.max_past_frames, options_.cache_storage, options_.window),
         .camera_entries = KvCache(c.cam_trunk_depth, c.cam_heads, cam_head_dim, c.cam_iterations,
-                                  options_.max_past_frames),
+                                  options_.max_past_frames, Storage::kF32, options_.window),
         .camera_iterations = {Tensor<float, 4>(camera_shape()), Tensor<float, 4>(camera_shape())},
         .depth_embeddings = make_dpt_embeddings(geometry_model.depth_head, h, w, H, W),
         .pose_encodings =

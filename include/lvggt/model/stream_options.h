@@ -4,6 +4,7 @@
 #include <cstdint>
 
 #include "lvggt/core/storage.h"
+#include "lvggt/model/window_policy.h"
 
 namespace lvggt {
 
@@ -14,6 +15,7 @@ enum class CameraCache {
 
 struct StreamOptions {
   std::int64_t max_past_frames = 128;  // frames kept in the caches after each push; at least 1
+  WindowPolicy window = {};            // which of them make room; as published, the oldest
   CameraCache camera_cache = CameraCache::kStream;
   Storage cache_storage = Storage::kF32;  // of the cached keys and values: f32, bf16 or int8
   // Give a camera whose pose encoding cannot be decoded (a field of view of 0, say) focal lengths
