@@ -34,9 +34,9 @@ std::pair<ErrorKind, std::string> error_of(Load&& load) {
 }
 
 void check_refused(const std::string& bytes, ErrorKind kind, const std::string& reason) {
-  const auto [found, message] = error_of([&] { decode(bytes); });
-  CHECK(found == kind);
-  CHECK_MESSAGE(message.find(reason) != std::string::npos, message);
+  const std::pair<ErrorKind, std::string> error = error_of([&] { decode(bytes); });
+  CHECK(error.first == kind);
+  CHECK_MESSAGE(error.second.find(reason) != std::string::npos, error.second);
 }
 
 using Rgb = std::array<int, 3>;

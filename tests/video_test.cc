@@ -111,13 +111,14 @@ TEST_CASE("C20: videos of 1 and 2 frames work, one of 0 frames is refused") {
 TEST_CASE("C21: a video cut in the middle gives the frames before the cut and is partial") {
   const std::array<std::pair<const char*, std::size_t>, 3> cuts{
       {{"bframes.mp4", 2523}, {"bframes.mkv", 2210}, {"mpeg4.avi", 6800}}};
-  for (const auto& [name, length] : cuts) {
+  for (const auto& cut : cuts) {
+    const char* const name = cut.first;
     CAPTURE(name);
     const std::string whole = read_file(video(name));
     const Run all = run(video(name));
     CHECK(all.frames.size() == 12);
     CHECK_FALSE(all.report.partial);
-    const Run part = run_bytes(whole.substr(0, length), name);
+    const Run part = run_bytes(whole.substr(0, cut.second), name);
     CHECK(part.report.partial);
     CHECK(contains(part.warnings, "ends early, after frame "));
     REQUIRE(part.frames.size() >= 4);

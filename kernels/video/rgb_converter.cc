@@ -76,7 +76,7 @@ Image RgbConverter::convert(const AVFrame& frame) {
                                      static_cast<int>(size.width), static_cast<int>(size.height),
                                      AV_PIX_FMT_RGB24, kFlags, nullptr, nullptr, nullptr));
   if (!scaler_)
-    fail(ErrorKind::kUnsupported, "pixels of the format ",
+    fail(ErrorKind::kUnsupported, name_, ": pixels of the format ",
          av_get_pix_fmt_name(static_cast<AVPixelFormat>(frame.format)),
          " cannot be converted to RGB");
   constexpr int kUnchanged = 1 << 16;
@@ -93,7 +93,7 @@ Image RgbConverter::convert(const AVFrame& frame) {
   const int num_rows =
       sws_scale(scaler_.get(), frame.data, frame.linesize, 0, frame.height, planes, strides);
   if (num_rows != size.height)
-    fail(ErrorKind::kFormat, "the pixels cannot be converted: ", error_text(num_rows));
+    fail(ErrorKind::kFormat, name_, ": the pixels cannot be converted: ", error_text(num_rows));
   const View<const std::uint8_t, 3> picture(
       rows_.data(), Shape{size.height, size.width, std::int64_t{3}}, {stride, 3, 1});
   return {detail::reoriented(picture, orientation_), {}};

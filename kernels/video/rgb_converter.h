@@ -3,6 +3,7 @@
 
 #include <cstdint>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "kernels/io/orientation.h"
@@ -19,9 +20,10 @@ struct PictureSize {
 // Decoded frames as upright RGB pictures with square pixels.
 class RgbConverter {
  public:
-  // `pixel_aspect` is width to height of a stored pixel as the container has it, 0 if unknown.
-  RgbConverter(detail::Orientation orientation, AVRational pixel_aspect)
-      : orientation_(orientation), pixel_aspect_(pixel_aspect) {}
+  // `name` stands for the video in messages; `pixel_aspect` is width to height of a stored pixel as
+  // the container has it, 0 if unknown.
+  RgbConverter(std::string name, detail::Orientation orientation, AVRational pixel_aspect)
+      : name_(std::move(name)), orientation_(orientation), pixel_aspect_(pixel_aspect) {}
 
   // Size of the picture that convert() makes of `frame`.
   PictureSize size_of(const AVFrame& frame) const;
@@ -35,6 +37,7 @@ class RgbConverter {
   AVRational aspect_of(const AVFrame& frame) const;
   PictureSize stretched_size(const AVFrame& frame) const;
 
+  std::string name_;
   detail::Orientation orientation_;
   AVRational pixel_aspect_;
   Handle<SwsContext> scaler_;

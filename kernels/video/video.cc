@@ -37,6 +37,9 @@ Handle<AVCodecContext> open_decoder(const std::string& path, const Demuxer& demu
   return decoder;
 }
 
+// More frames than any codec holds back.
+constexpr int kMaxDrainingErrors = 64;
+
 class VideoSource : public FrameSource {
  public:
   VideoSource(const std::string& path, const FrameSourceOptions& options)
@@ -44,7 +47,7 @@ class VideoSource : public FrameSource {
         options_(options),
         demuxer_(path, options.limits, warnings_),
         decoder_(open_decoder(path, demuxer_, options.limits)),
-        converter_(demuxer_.orientation(), demuxer_.stream().sample_aspect_ratio),
+        converter_(path, demuxer_.orientation(), demuxer_.stream().sample_aspect_ratio),
         packet_(allocated(av_packet_alloc())),
         frame_(allocated(av_frame_alloc())) {}
 
@@ -78,11 +81,11 @@ class VideoSource : public FrameSource {
       if (result == AVERROR_EOF) return false;
       if (result == AVERROR(ENOMEM))
         fail(ErrorKind::kMemory, path_, ": the decoder ran out of memory");
+      if (result == AVERROR(EAGAIN) && is_draining_) return false;
       if (result != AVERROR(EAGAIN)) {
         count_damage(result);
-        if (is_draining_) return false;
-      } else if (is_draining_) {
-        return false;
+        // What is left in the decoder may still hold good frames, but not without end.
+        if (is_draining_ && ++num_draining_errors_ > kMaxDrainingErrors) return false;
       }
       if (!is_draining_) feed_decoder();
     }
@@ -185,6 +188,7 @@ class VideoSource : public FrameSource {
   std::int64_t num_delivered_ = 0;
   double time_ = 0;  // of the last decoded frame
   bool is_draining_ = false;
+  int num_draining_errors_ = 0;
   bool is_finished_ = false;
   std::string first_damage_;
   std::int64_t first_damaged_frame_ = 0;
