@@ -263,6 +263,18 @@ TEST_CASE("B21: a pickle that would run os.system is refused and runs nothing") 
   }
 }
 
+TEST_CASE("PthFile: names that safetensors could not hold are refused") {
+  for (const char* name : {"a\nb", "\x1b[2J", "../a"}) {
+    const std::string pickle = PickleWriter()
+                                   .op('}')
+                                   .text(name)
+                                   .tensor("FloatStorage", "0", 4, 0, {4}, {1})
+                                   .op('s')
+                                   .done();
+    check_fault(open_pickle(pickle), ErrorKind::kFormat, "in the state dict contains");
+  }
+}
+
 TEST_CASE("PthFile: broken pickles are refused") {
   CHECK(open_pickle("").kind == ErrorKind::kFormat);
   const std::string whole = one_tensor(0, {4}, {1});

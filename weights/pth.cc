@@ -6,6 +6,8 @@
 #include <cstring>
 #include <set>
 
+#include "kernels/io/printable.h"
+#include "kernels/io/safetensors_header.h"
 #include "lvggt/core/error.h"
 #include "lvggt/io/checked.h"
 #include "lvggt/io/safetensors.h"
@@ -184,6 +186,10 @@ void PthFile::add_tensors(PickleId dict) {
     const PickleValue& value = pickle_.values[items[i + 1]];
     const std::string name = key.kind == PickleKind::kString ? pickle_.strings[key.payload]
                                                              : std::string("(not a string)");
+    const std::string fault = tensor_name_fault(name, {});
+    if (!fault.empty())
+      fail(ErrorKind::kFormat, path(), ": the name ", in_quotes(name), " in the state dict ",
+           fault);
     if (key.kind == PickleKind::kString && value.kind == PickleKind::kTensor) {
       tensors_.push_back(checked_tensor(name, pickle_.tensors[value.payload]));
     } else {
