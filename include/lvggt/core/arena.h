@@ -23,12 +23,14 @@ class Arena {
   // Everything allocated after a Scope opens is released when it ends; scopes nest.
   class Scope {
    public:
-    explicit Scope(Arena& arena) : arena_(arena), block_(arena.block_), used_(arena.used_) {
+    explicit Scope(Arena& arena)
+        : arena_(arena), block_(arena.block_), used_(arena.used_), live_(arena.live_) {
       ++arena.depth_;
     }
     ~Scope() {
       arena_.block_ = block_;
       arena_.used_ = used_;
+      arena_.live_ = live_;
       if (--arena_.depth_ == 0) arena_.merge();
     }
     Scope(const Scope&) = delete;
@@ -38,6 +40,7 @@ class Arena {
     Arena& arena_;
     std::size_t block_;
     std::size_t used_;
+    std::size_t live_;
   };
 
   // An uninitialised dense array, valid until the innermost open scope ends.
@@ -70,9 +73,8 @@ class Arena {
     }
     std::byte* p = blocks_[block_].data() + used_;
     used_ += bytes;
-    std::size_t in_use = used_;
-    for (std::size_t i = 0; i < block_; ++i) in_use += blocks_[i].num_bytes();
-    peak_ = std::max(peak_, in_use);
+    live_ += bytes;
+    peak_ = std::max(peak_, live_);
     return p;
   }
 
@@ -86,7 +88,8 @@ class Arena {
   std::vector<Tensor<std::byte, 1>> blocks_;
   std::size_t block_ = 0;  // current block and the bytes used in it
   std::size_t used_ = 0;
-  std::size_t peak_ = 0;
+  std::size_t live_ = 0;  // bytes handed out, without the unused ends of earlier blocks
+  std::size_t peak_ = 0;  // largest live_
   int depth_ = 0;
 };
 
