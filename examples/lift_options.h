@@ -18,6 +18,7 @@
 // The options of lift_video.
 struct LiftOptions {
   std::string video, out, summary, mode = "crop", camera_cache = "stream", point_colors = "input";
+  std::string weights_storage = "f32", cache_storage = "f32";
   lvggt::LoadOptions weights;
   lvggt::FrameSourceOptions frames;
   lvggt::PreprocessOptions preprocess;
@@ -47,6 +48,8 @@ struct LiftOptions {
     // More past frames than the run has are never reached.
     stream.max_past_frames = std::min(stream.max_past_frames, frames.max_frames);
     weights.points = false;
+    weights.storage = StoragePolicy::of(parse_storage(weights_storage, "--weights-storage"));
+    stream.cache_storage = parse_storage(cache_storage, "--cache-storage");
     outputs.ply = !no_ply;
     outputs.depth = !no_depth;
     outputs.confidence = !no_confidence;
@@ -83,6 +86,8 @@ struct LiftOptions {
                                : concat(frames.max_frames)},
             {"max_past_frames", concat(stream.max_past_frames)},
             {"camera_cache", camera_cache},
+            {"weights_storage", weights_storage},
+            {"cache_storage", cache_storage},
             {"decoder", yes(stream.decoder)},
             {"percentile", percentile},
             {"point_colors", point_colors},
@@ -147,6 +152,18 @@ inline void add_model(lvggt::cli::Program& program, LiftOptions& o) {
           "stream: cameras see those of past frames; frame: each alone, as the released demo")
       ->check(CLI::IsMember({"stream", "frame"}))
       ->type_name("KIND")
+      ->capture_default_str();
+  program.app()
+      .add_option("--weights-storage", o.weights_storage,
+                  "How weights are kept in memory: f32, bf16, f16 or int8; narrower is less exact")
+      ->check(CLI::IsMember({"f32", "bf16", "f16", "int8"}))
+      ->type_name("TYPE")
+      ->capture_default_str();
+  program.app()
+      .add_option("--cache-storage", o.cache_storage,
+                  "How past frames are kept in memory: f32, bf16 or int8; narrower is less exact")
+      ->check(CLI::IsMember({"f32", "bf16", "int8"}))
+      ->type_name("TYPE")
       ->capture_default_str();
   lvggt::cli::add_threads_option(program, o.threads);
   program.add_bytes("--memory-limit", o.memory_limit,
