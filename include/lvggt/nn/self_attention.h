@@ -55,11 +55,7 @@ inline void attend_within_groups(View<float, 3> y, View<const float, 3> q, View<
 // q- or k-norm: LayerNorm over the D values of every head, in place.   x: [N, heads, D]
 inline void head_norm(View<float, 3> x, const LayerNorm& norm, Context& ctx) {
   if (norm.weight.empty()) return;
-  const auto [N, heads, D] = x.shape();
-  for (std::int64_t head = 0; head < heads; ++head) {
-    const View<float, 2> rows(x.data() + head * x.stride(1), Shape{N, D}, {x.stride(0), 1});
-    layer_norm_forward(rows, rows, norm, ctx);
-  }
+  layer_norm_forward(x, x, norm.weight, norm.bias, norm.eps, ctx);
 }
 
 // y = residual + gamma * proj(attention(qkv(x))), with qk-norm and rotary embedding on q and k.
