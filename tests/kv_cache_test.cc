@@ -49,18 +49,6 @@ TEST_CASE("KvCache: a frame that is not ended is overwritten by the next") {
   CHECK(key_of(groups[1]) == 3);
 }
 
-TEST_CASE("KvCache: evict_oldest drops one frame") {
-  Context ctx(1);
-  KvCache cache(2, 2, 4, 5, 3);
-  for (int f = 0; f < 2; ++f) {
-    append(cache, static_cast<float>(f), ctx);
-    cache.end_frame();
-  }
-  cache.evict_oldest();
-  CHECK(cache.num_frames() == 1);
-  CHECK(key_of(append(cache, 7, ctx)[0]) == 1);
-}
-
 TEST_CASE("KvCache: windows that no address space holds and empty ones are refused") {
   CHECK_THROWS_AS(KvCache(24, 16, 64, 782, kMaxPastFrames), Error);
   CHECK_THROWS_AS(KvCache(2, 2, 4, 5, 0), Error);

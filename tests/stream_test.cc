@@ -3,33 +3,10 @@
 
 #include <doctest/doctest.h>
 
-#include <atomic>
 #include <cmath>
-#include <cstdlib>
-#include <new>
 
+#include "tests/support/allocations.h"
 #include "tests/support/tiny_model.h"
-
-namespace {
-std::atomic<std::int64_t> num_allocations{0};
-}
-
-// Counts every use of the heap through C++ in this program, to prove that streams stop using it.
-void* operator new(std::size_t size) {
-  ++num_allocations;
-  if (void* p = std::malloc(size == 0 ? 1 : size)) return p;
-  throw std::bad_alloc();
-}
-void* operator new(std::size_t size, std::align_val_t alignment) {
-  ++num_allocations;
-  const auto align = static_cast<std::size_t>(alignment);
-  if (void* p = std::aligned_alloc(align, (size + align) / align * align)) return p;
-  throw std::bad_alloc();
-}
-void operator delete(void* p) noexcept { std::free(p); }
-void operator delete(void* p, std::size_t) noexcept { std::free(p); }
-void operator delete(void* p, std::align_val_t) noexcept { std::free(p); }
-void operator delete(void* p, std::size_t, std::align_val_t) noexcept { std::free(p); }
 
 using namespace lvggt;
 using namespace lvggt::test;
@@ -79,9 +56,9 @@ TEST_CASE("Stream: from the second frame on, push does not touch the heap") {
   const Tensor<float, 4> images = deterministic_images(1, 8, 56, 84);
   stream.push(images[0]);
   for (std::int64_t f = 1; f < 8; ++f) {
-    const std::int64_t before = num_allocations;
+    const std::int64_t before = num_allocations();
     stream.push(images[f]);
-    CHECK_MESSAGE(num_allocations == before, "frame ", f, ": ", num_allocations - before,
+    CHECK_MESSAGE(num_allocations() == before, "frame ", f, ": ", num_allocations() - before,
                   " allocations");
   }
 }
