@@ -45,6 +45,7 @@ struct Options {
   std::uint64_t seed = 0;
   int threads = 0;
   bool force = false;
+  bool list = false;
 };
 
 ModelConfig config_of(const std::string& option) {
@@ -80,7 +81,25 @@ void report(const std::string& path, std::size_t num_tensors, std::int64_t num_b
               lvggt::cli::bytes_text(static_cast<std::size_t>(num_bytes)).c_str());
 }
 
+// The loader's contract, as in names.tsv.
+void print_tensors(const std::vector<TensorSpec>& specs, const char* part) {
+  for (const TensorSpec& spec : specs)
+    std::printf("%s\tF32\t%s\t%s\n", spec.name.c_str(), lvggt::shape_text(spec.shape).c_str(),
+                part);
+}
+
+int list_tensors(const Options& options) {
+  const ModelConfig config = config_of(options.config);
+  std::printf("name\tdtype\tshape\tcheckpoint\n");
+  if (options.part != "decoder") print_tensors(lvggt::geometry_tensors(config), "geometry");
+  if (options.part != "geometry") print_tensors(lvggt::decoder_tensors(config), "decoder");
+  return 0;
+}
+
 int run(const Options& options) {
+  if (options.list) return list_tensors(options);
+  if (options.output.empty())
+    lvggt::fail(lvggt::ErrorKind::kUsage, "the name of the .safetensors file to write is missing");
   const bool two_files = !options.decoder_output.empty();
   if (two_files && options.part != "all")
     lvggt::fail(lvggt::ErrorKind::kUsage, "--decoder-out writes both parts, so --part ",
@@ -112,7 +131,7 @@ int main(int argc, char** argv) {
   lvggt::cli::Program program("weights_init", kDescription, LVGGT_VERSION);
   CLI::App& app = program.app();
   app.footer(kFooter);
-  app.add_option("output", options.output, "The .safetensors file to write")->required();
+  app.add_option("output", options.output, "The .safetensors file to write");
   app.add_option("--decoder-out", options.decoder_output,
                  "Write the decoder's tensors to this file instead of the same one");
   app.add_option("--config", options.config, "'published', or a JSON file with sizes")
@@ -123,6 +142,7 @@ int main(int argc, char** argv) {
   program.add_number<std::uint64_t>("--seed", options.seed, "The same seed gives the same weights",
                                     0, std::numeric_limits<std::uint64_t>::max());
   lvggt::cli::add_threads_option(program, options.threads);
+  app.add_flag("--list", options.list, "Print names and shapes as a table and write nothing");
   app.add_flag("--force", options.force, "Replace existing files");
   return program.run(argc, argv, [&] { return run(options); });
 }
