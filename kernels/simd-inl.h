@@ -25,7 +25,14 @@ HWY_INLINE hn::Vec<D> load_first(D d, const float* p, std::int64_t n) {
   const std::int64_t lanes = static_cast<std::int64_t>(hn::Lanes(d));
   if (HWY_LIKELY(n >= lanes)) return hn::LoadU(d, p);
   if (n <= 0) return hn::Zero(d);
-  return hn::MaskedLoad(hn::FirstN(d, static_cast<std::size_t>(n)), d, p);
+  if constexpr (HWY_MEM_OPS_MIGHT_FAULT) {
+    // Here MaskedLoad may load the whole vector, from an address it takes to be aligned.
+    HWY_ALIGN float buffer[hn::MaxLanes(D())] = {};
+    for (std::int64_t i = 0; i < n; ++i) buffer[i] = p[i];
+    return hn::Load(d, buffer);
+  } else {
+    return hn::MaskedLoad(hn::FirstN(d, static_cast<std::size_t>(n)), d, p);
+  }
 }
 
 // Stores the first n lanes of v; n may be more than a vector holds, or nothing.
