@@ -44,6 +44,11 @@ report 'R8: the library changes the floating-point modes' \
 report 'R10: the library opens the network' \
   "$(code "${library[@]}" | grep -E '#include <(sys/socket|netinet|netdb|arpa|curl)' || true)"
 
+# R6: sizes from files are multiplied through lvggt/io/checked.h only, where a product cannot wrap.
+report 'R6: a loader multiplies without checking' \
+  "$(code kernels/io weights | grep -E '^(kernels/io/safetensors|weights/(pth|pickle|zip_archive|convert))' |
+     grep -E '[][:alnum:]_)] \* [[:alnum:]_(]|\*= ' || true)"
+
 # Every file says its licence first (scripts after the line that names their interpreter).
 report 'A file without its licence line' \
   "$(cd "$source_dir" && find include kernels weights examples tests bench \

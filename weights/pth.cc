@@ -36,7 +36,7 @@ bool strides_are_dense(const PthTensor& tensor) {
   for (std::size_t axis = tensor.shape.size(); axis-- > 0;) {
     if (tensor.shape[axis] == 1) continue;
     if (tensor.view.strides[axis] != stride) return false;
-    stride *= tensor.shape[axis];  // at most the number of elements, which was checked
+    stride = size_product(stride, tensor.shape[axis]);
   }
   return true;
 }
@@ -48,11 +48,12 @@ void gather(const PthTensor& tensor, std::span<const std::byte> storage, std::sp
   std::vector<std::int64_t> index(rank, 0);
   std::int64_t at = tensor.view.offset;  // every reachable value was checked to lie in the storage
   for (std::size_t done = 0; done < out.size(); done += item) {
-    std::memcpy(out.data() + done, storage.data() + static_cast<std::size_t>(at) * item, item);
+    std::memcpy(out.data() + done, storage.data() + size_product(at, dtype_size(tensor.dtype)),
+                item);
     for (std::size_t axis = rank; axis-- > 0;) {
       at += tensor.view.strides[axis];
       if (++index[axis] < tensor.shape[axis]) break;
-      at -= tensor.view.strides[axis] * tensor.shape[axis];
+      at -= size_product(tensor.view.strides[axis], tensor.shape[axis]);
       index[axis] = 0;
     }
   }
@@ -250,7 +251,7 @@ void PthFile::read(const PthTensor& tensor, std::span<std::byte> out) {
     cached_entry_ = entry;
   }
   if (dense) {
-    const auto first = static_cast<std::size_t>(tensor.view.offset * dtype_size(tensor.dtype));
+    const auto first = size_product(tensor.view.offset, dtype_size(tensor.dtype));
     std::memcpy(out.data(), cache_.data() + first, out.size());
   } else {
     gather(tensor, cache_, out);

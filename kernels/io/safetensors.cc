@@ -10,6 +10,7 @@
 #include "kernels/io/printable.h"
 #include "kernels/io/safetensors_header.h"
 #include "kernels/io/safetensors_index.h"
+#include "lvggt/io/checked.h"
 
 namespace lvggt {
 namespace {
@@ -80,7 +81,7 @@ void for_each_block(const InputFile& file, std::int64_t offset, std::int64_t cou
   std::vector<T> block(static_cast<std::size_t>(std::min(count, kBlockElements)));
   for (std::int64_t done = 0; done < count;) {
     const std::int64_t n = std::min(count - done, kBlockElements);
-    const auto num_bytes = static_cast<std::size_t>(n) * sizeof(T);
+    const auto num_bytes = static_cast<std::size_t>(size_product(n, sizeof(T)));
     file.read_at(offset, block.data(), num_bytes);
     body(std::span<const T>(block.data(), static_cast<std::size_t>(n)), done);
     offset += static_cast<std::int64_t>(num_bytes);
@@ -89,11 +90,13 @@ void for_each_block(const InputFile& file, std::int64_t offset, std::int64_t cou
 }
 
 void read_widened(const InputFile& file, Dtype dtype, std::int64_t offset, std::span<float> out) {
-  const auto item = static_cast<std::size_t>(dtype_size(dtype));
-  std::vector<std::byte> block(std::min<std::size_t>(out.size(), kBlockElements) * item);
+  const auto num_bytes = [&](std::size_t n) {
+    return static_cast<std::size_t>(size_product(static_cast<std::int64_t>(n), dtype_size(dtype)));
+  };
+  std::vector<std::byte> block(num_bytes(std::min<std::size_t>(out.size(), kBlockElements)));
   while (!out.empty()) {
     const auto part = out.first(std::min<std::size_t>(out.size(), kBlockElements));
-    const auto bytes = std::span(block).first(part.size() * item);
+    const auto bytes = std::span(block).first(num_bytes(part.size()));
     file.read_at(offset, bytes.data(), bytes.size());
     to_float32(dtype, bytes, part);
     offset += static_cast<std::int64_t>(bytes.size());
@@ -220,7 +223,7 @@ void Safetensors::read_part(std::string_view name, std::int64_t first, std::span
               " from ", first, " are asked for");
   const InputFile& file = files_[entry.file_idx];
   // In range, because the part lies inside the tensor and the tensor inside the file.
-  const std::int64_t offset = entry.offset + first * dtype_size(entry.dtype);
+  const std::int64_t offset = entry.offset + size_product(first, dtype_size(entry.dtype));
   if (!dtype_is_float(entry.dtype))
     fail(ErrorKind::kMismatch, path_, ": tensor ", in_quotes(name), " holds ",
          dtype_name(entry.dtype), ", but floating-point numbers are expected");

@@ -163,7 +163,8 @@ void SafetensorsWriter::write(std::string_view name, std::span<const float> valu
       append(name, std::as_bytes(part));
       continue;
     }
-    block.resize(part.size() * static_cast<std::size_t>(dtype_size(dtype)));
+    block.resize(static_cast<std::size_t>(
+        size_product(static_cast<std::int64_t>(part.size()), dtype_size(dtype))));
     from_float32(dtype, part, block);
     append(name, block);
   }
