@@ -5,9 +5,9 @@
 
 #include <array>
 #include <bit>
-#include <clocale>
 #include <cstdint>
 #include <cstdlib>
+#include <locale>
 
 #include "lvggt/io/json.h"
 
@@ -67,4 +67,19 @@ TEST_CASE("JsonWriter: what it writes parses to what was meant") {
   CHECK(rows[1].as_object("row").empty());
   CHECK(rows[2].as_int64("x") == 7);
   CHECK(text.back() == '\n');
+}
+
+TEST_CASE("D05: a locale with comma decimals does not reach files or messages") {
+  struct Comma : std::numpunct<char> {
+    char do_decimal_point() const override { return ','; }
+    char do_thousands_sep() const override { return '.'; }
+    std::string do_grouping() const override { return "\3"; }
+  };
+  const std::locale before = std::locale::global(std::locale(std::locale(), new Comma));
+  std::string text;
+  append_number(text, 12345.5);
+  const std::string message = concat(12345.5);
+  std::locale::global(before);
+  CHECK(text == "12345.5");
+  CHECK(message == "12345.5");
 }

@@ -366,6 +366,23 @@ TEST_CASE(
   CHECK(scene.lift({"--resume"}).says("complete already"));
 }
 
+TEST_CASE("C21: a video that ends early gives the frames there are, status 5, and says so") {
+  const Scene scene(0);
+  const std::string clip = test::read_bytes(LVGGT_TEST_DATA "/../examples/data/cup_24.mp4");
+  test::write_bytes(scene / "cut.mp4", clip.substr(0, clip.size() / 3));
+  const Result result = scene.run({scene / "cut.mp4", "--weights", scene / "model.safetensors",
+                                   "--out", scene / "out", "--size", "84", "--no-ply", "--no-depth",
+                                   "--no-confidence", "--no-rgb"});
+  INFO(result.err);
+  CHECK(result.status == 5);
+  CHECK(result.says("warning: "));
+  CHECK(scene.status() == "partial");
+  const auto frames = scene.json("out/cameras.json").find("frames")->as_array("frames").size();
+  CHECK(frames >= 1);
+  CHECK(frames < 24);
+  CHECK(fs::exists(scene / "out/contact_sheet.png"));
+}
+
 TEST_CASE("D09: a disk that is full ends the run with status 1 and leaves no cut file") {
   const Scene scene;
   test::ChildProcess child(scene.command(), 60'000);  // a point cloud has more
