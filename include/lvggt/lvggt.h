@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-// lvggt: from a video to a coloured, language-featured 4D point cloud, frame by frame. This is the one
-// header to include; a whole program (examples/embed, with its CMakeLists.txt):
+// lvggt: from a video to a coloured, language-featured 4D point cloud, frame by frame. This is the
+// one header to include; a whole program (examples/embed, with its CMakeLists.txt):
 //
 //   #include <lvggt/io/video.h>
 //   #include <lvggt/lvggt.h>
@@ -10,32 +10,36 @@
 //   #include <cstdio>
 //
 //   int main(int argc, char** argv) try {
-//     if (argc != 3) lvggt::fail(lvggt::ErrorKind::kUsage, "give a video or folder and the weights");
+//     if (argc < 3) lvggt::fail(lvggt::ErrorKind::kUsage, "give a video or folder, and weights");
 //     lvggt::Context ctx;  // all CPUs this process may use
-//     const auto model = lvggt::LangVggt::load({.weights = argv[2]}, ctx);
+//     const auto model =
+//         lvggt::LangVggt::load({.weights = argv[2], .decoder = argc > 3 ? argv[3] : ""}, ctx);
 //     const lvggt::PreprocessOptions size{.size = static_cast<int>(model.config().img_size)};
 //
-//     lvggt::Stream stream(model, ctx);
+//     lvggt::Stream stream(model, ctx, {.max_past_frames = 8});
 //     const auto frames = lvggt::open_frames(argv[1], {}, lvggt::open_video);
 //     while (const auto input = frames->next()) {
 //       const lvggt::PreparedFrame prepared = lvggt::prepare_frame(input->image, size);
-//       const lvggt::Frame frame = stream.push(prepared.pixels);  // its views live until the next push
+//       const lvggt::Frame frame = stream.push(prepared.pixels);  // views live until the next push
 //
 //       const auto [H, W] = frame.depth.shape();
-//       const auto& pose = frame.camera.cam_from_world;           // [R | t], OpenCV axes
-//       const auto meaning = frame.language[0][H / 2][W / 2];     // [lang_dim], of the smallest level
-//       std::printf("%6.2f s  t (%.3f %.3f %.3f)  depth %.3f  semantics (%.3f %.3f %.3f)\n",
-//                   input->timestamp, pose(0, 3), pose(1, 3), pose(2, 3), frame.depth(H / 2, W / 2),
-//                   meaning(0), meaning(1), meaning(2));
+//       const auto& pose = frame.camera.cam_from_world;  // [R | t], OpenCV axes
+//       std::printf("%6.2f s  t (%.3f %.3f %.3f)  depth %.3f", input->timestamp, pose(0, 3), pose(1, 3),
+//                   pose(2, 3), frame.depth(H / 2, W / 2));
+//       if (model.has_decoder()) {
+//         const auto meaning = frame.language[0][H / 2][W / 2];  // [lang_dim], smallest level
+//         std::printf("  semantics (%.3f %.3f %.3f)", meaning(0), meaning(1), meaning(2));
+//       }
+//       std::printf("\n");
 //     }
 //   } catch (const lvggt::Error& error) {
 //     std::fprintf(stderr, "embed: %s\n", error.what());
 //     return lvggt::exit_code(error.kind());
 //   }
 //
-// Errors are exceptions of type lvggt::Error. The library prints nothing, reads no environment variable,
-// installs no signal handler and has no globals. Link lvggt::lvggt; reading video files also needs
-// lvggt/io/video.h and lvggt::video (FFmpeg). What is where:
+// Errors are exceptions of type lvggt::Error. The library prints nothing, reads no environment
+// variable, installs no signal handler and has no globals. Link lvggt::lvggt; reading video files
+// also needs lvggt/io/video.h and lvggt::video (FFmpeg). What is where:
 //
 //   core/      Shape, View, Tensor; Error; Context (threads, scratch memory)
 //   model/     LangVggt, Stream, Frame; ModelConfig; names and shapes of the weights

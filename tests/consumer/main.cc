@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-// A user's program: includes the library in two translation units, links it and sees it report an error.
-#include <cstdio>
-
+// A user's program: includes the library in two translation units, links it and sees it report an
+// error.
 #include <lvggt/lvggt.h>
+
+#include <cstdio>
 
 bool all_chunks_run();  // other.cc
 
