@@ -128,6 +128,63 @@ TEST_CASE("Stream: the paper's ablations run and give what they should") {
   check(config);
 }
 
+TEST_CASE("Stream: configurations unlike the published one run, and streams agree with batches") {
+  ModelConfig config = tiny_config();
+  SUBCASE("other widths, heads and patches") {
+    config.embed_dim = 48;
+    config.dino_heads = 3;
+    config.agg_heads = 2;
+    config.cam_heads = 6;
+    config.patch_size = 16;
+    config.img_size = 48;
+    config.mlp_ratio = 2.5;
+  }
+  SUBCASE("qk-norm elsewhere, none in the aggregator") {
+    config.dino_qk_norm = config.cam_qk_norm = true;
+    config.agg_qk_norm = false;
+  }
+  SUBCASE("no registers, no trunk, taps that repeat") {
+    config.num_register_tokens = 0;
+    config.cam_trunk_depth = 0;
+    config.agg_depth = 3;
+    config.taps = {0, 1, 1, 1};
+  }
+  SUBCASE("many refinements") { config.cam_iterations = 19; }
+  SUBCASE("no position embedding in the heads, odd channels") {
+    config.dpt_pos_embed_ratio = 0;
+    config.dpt_features = 40;
+    config.sbd_features = 7;
+    config.sbd_hidden_dim = 3;
+    config.sbd_out_channels = {5, 6, 7, 9};
+  }
+  TinyModel tiny(config);
+  const std::int64_t H = 2 * config.patch_size, W = 3 * config.patch_size;
+  const Tensor<float, 4> images = deterministic_images(1, 3, H, W);
+  StageTimes times;
+  const ClipGeometry clip =
+      forward_clip(images, tiny.model.geometry(), BatchMode::kCausal, times, nullptr, tiny.ctx);
+  StreamOptions options;
+  options.points = true;
+  options.allow_degenerate_camera = true;
+  Stream stream(tiny.model, tiny.ctx, options);
+  const FrameGeometry& geometry = clip.geometry;
+  const std::int64_t P = geometry.num_tokens(tiny.model.geometry().aggregator);
+  Tensor<float, 2> depth(Shape{H, W}), confidence(Shape{H, W});
+  const DptHead& head = tiny.model.geometry().depth_head;
+  for (std::int64_t f = 0; f < 3; ++f) {
+    const Frame frame = stream.push(images[f]);
+    CHECK(all_finite(frame.language));
+    CHECK(all_finite(frame.points));
+    std::array<View<const float, 2>, 4> taps;
+    for (std::size_t i = 0; i < 4; ++i)
+      taps[i] = clip.taps[i].view().narrow(0, f * P + config.patch_start_idx(), (f + 1) * P);
+    predict_depth(depth, confidence, taps, geometry, head,
+                  make_dpt_embeddings(head, geometry.h, geometry.w, H, W), tiny.ctx);
+    CHECK_CLOSE(frame.depth, depth, 0, 1e-4);
+  }
+  CHECK(stream.camera_cache_length() == 3 * config.cam_iterations);
+}
+
 TEST_CASE("Stream: parts that are not asked for are not computed") {
   TinyModel tiny(small_config());
   const Tensor<float, 4> images = deterministic_images(1, 1, 28, 28);
