@@ -85,6 +85,8 @@ struct LiftOptions {
                                ? "all"
                                : concat(frames.max_frames)},
             {"max_past_frames", concat(stream.max_past_frames)},
+            {"keep_first_frame", yes(stream.window.keep_first)},
+            {"keep_every", concat(stream.window.keep_every)},
             {"camera_cache", camera_cache},
             {"weights_storage", weights_storage},
             {"cache_storage", cache_storage},
@@ -146,6 +148,12 @@ inline void add_model(lvggt::cli::Program& program, LiftOptions& o) {
   program.add_number<std::int64_t>("--max-past-frames", o.stream.max_past_frames,
                                    "Past frames the model sees; memory and time grow with it", 1,
                                    std::int64_t{1} << 20);
+  program.app().add_flag(
+      "--keep-first-frame", o.stream.window.keep_first,
+      "When they are too many, never forget the first: it fixes the world frame");
+  program.add_number<std::int64_t>(
+      "--keep-every", o.stream.window.keep_every,
+      "When they are too many, forget every N-th last; 0: oldest first", 0, std::int64_t{1} << 20);
   program.app()
       .add_option(
           "--camera-cache", o.camera_cache,
