@@ -16,13 +16,13 @@ namespace lvggt {
 void activation_forward(View<float, 2> y, View<const float, 2> x, Activation activation,
                         Context& ctx);
 
-// Depth heads: depth = exp(x[:,0]), confidence = 1 + exp(x[:,1]).   x: [N, 2]   depth, confidence:
-// [N]
+// Depth heads: depth = exp(x[:,0]), confidence = 1 + exp(x[:,1]).
+//   x: [N, 2]   depth, confidence: [N]
 void depth_activation(View<float, 1> depth, View<float, 1> confidence, View<const float, 2> x,
                       Context& ctx);
 
-// Point heads: point = sign(v) expm1(|v|) of the first three channels, confidence = 1 +
-// exp(x[:,3]).
+// Point heads: point = sign(v) expm1(|v|) of the first three channels,
+// confidence = 1 + exp(x[:,3]).
 //   x: [N, 4]   points: [N, 3]   confidence: [N]
 void point_activation(View<float, 2> points, View<float, 1> confidence, View<const float, 2> x,
                       Context& ctx);

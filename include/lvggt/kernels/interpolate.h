@@ -6,11 +6,11 @@
 
 namespace lvggt {
 
-// Bilinear resize, channels last, as torch.nn.functional.interpolate(mode="bilinear"). Source
-// coordinate of output i:  align_corners true: i (in-1)/(out-1);  false: max((i + 1/2) in/out -
-// 1/2, 0).
-//   y: [B, Ho, Wo, C]   x: [B, H, W, C]   pixels may be strided (y can be a slice of a concatenated
-//   map).
+// Bilinear resize, channels last, as torch.nn.functional.interpolate(mode="bilinear"). Output i reads
+//   align_corners true:   source coordinate i (in-1)/(out-1)
+//   align_corners false:  source coordinate max((i + 1/2) in/out - 1/2, 0)
+//   y: [B, Ho, Wo, C]   x: [B, H, W, C]
+// Pixels may be strided: y can be a slice of a concatenated map.
 void bilinear_forward(View<float, 4> y, View<const float, 4> x, bool align_corners, Context& ctx);
 
 // Bicubic resize with antialiasing, channels last, as interpolate(mode="bicubic", antialias=True,

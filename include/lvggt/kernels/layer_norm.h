@@ -12,8 +12,8 @@ namespace lvggt {
 void layer_norm_forward(View<float, 2> y, View<const float, 2> x, View<const float, 1> gamma,
                         View<const float, 1> beta, float eps, Context& ctx);
 
-// The same for every head of every token: the q/k norm.   y, x: [N, heads, D]   gamma, beta: [D] y
-// may be x.
+// The same for every head of every token: the q/k norm.
+//   y, x: [N, heads, D]   gamma, beta: [D]   y may be x.
 void layer_norm_forward(View<float, 3> y, View<const float, 3> x, View<const float, 1> gamma,
                         View<const float, 1> beta, float eps, Context& ctx);
 

@@ -18,8 +18,8 @@ struct RopeTable {
 // must be a multiple of 4.
 RopeTable make_rope_table(View<const std::int64_t, 2> positions, std::int64_t head_dim, float base);
 
-// y = x turned by its token's angles.   y, x: [N, heads, D]; row n uses table row n % P.   y may be
-// x.
+// y = x turned by its token's angles; token n uses row n % P of the table, N is a multiple of P.
+//   y, x: [N, heads, D]   y may be x.
 void rope_2d_forward(View<float, 3> y, View<const float, 3> x, const RopeTable& table,
                      Context& ctx);
 
