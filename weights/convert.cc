@@ -88,6 +88,7 @@ ConvertResult convert_weights(WeightSource& source, const std::string& output,
   for (std::size_t i = 0; i < source.tensors().size(); ++i) {
     const TensorEntry& tensor = source.tensors()[i];
     if (is_dropped(tensor.name, options.drop)) continue;
+    if (options.before_each) options.before_each();
     buffers.stored.resize(static_cast<std::size_t>(tensor.num_bytes));
     source.read(i, buffers.stored);
     if (dtype_is_float(tensor.dtype)) {

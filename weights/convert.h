@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
 #include <optional>
 #include <string>
 #include <vector>
@@ -14,8 +15,9 @@ namespace lvggt {
 struct ConvertOptions {
   std::optional<Dtype> dtype;  // of floating-point tensors in the output; otherwise as they are
   std::string config;          // JSON text to keep in the metadata; otherwise the input's, if any
-  std::vector<std::string> drop;  // tensors whose names begin so are left out
-  bool allow_nonfinite = false;   // accept NaN and infinity
+  std::vector<std::string> drop;      // tensors whose names begin so are left out
+  std::function<void()> before_each;  // called before each tensor is written; may throw to stop
+  bool allow_nonfinite = false;       // accept NaN and infinity
 };
 
 struct ConvertResult {

@@ -4,6 +4,7 @@
 #include <string>
 #include <vector>
 
+#include "lvggt/cli/interrupt.h"
 #include "lvggt/cli/program.h"
 #include "lvggt/io/atomic_file.h"
 #include "lvggt/io/hash.h"
@@ -57,8 +58,13 @@ lvggt::ConvertOptions convert_options(const Options& options) {
 }
 
 int run(const Options& options) {
+  const lvggt::cli::InterruptGuard interrupt;
   lvggt::check_output_file(options.output, options.force);
-  const lvggt::ConvertOptions convert = convert_options(options);
+  lvggt::ConvertOptions convert = convert_options(options);
+  convert.before_each = [&] {
+    if (interrupt.requested())
+      lvggt::fail(lvggt::ErrorKind::kInterrupted, "interrupted, nothing is written");
+  };
   if (!options.sha256.empty()) lvggt::check_sha256(options.input, options.sha256);
   const auto source = lvggt::WeightSource::open(options.input);
   for (const std::string& note : source->notes()) std::fprintf(stderr, "note: %s\n", note.c_str());

@@ -6,6 +6,7 @@
 #include <string>
 #include <vector>
 
+#include "lvggt/cli/interrupt.h"
 #include "lvggt/cli/program.h"
 #include "lvggt/cli/threads.h"
 #include "lvggt/core/context.h"
@@ -54,7 +55,8 @@ ModelConfig config_of(const std::string& option) {
 
 // Streams the tensors of `specs` into one file; returns the bytes written.
 std::int64_t write_weights(const std::string& path, const std::vector<TensorSpec>& specs,
-                           const ModelConfig& config, std::uint64_t seed, lvggt::Context& ctx) {
+                           const ModelConfig& config, std::uint64_t seed,
+                           const lvggt::cli::InterruptGuard& interrupt, lvggt::Context& ctx) {
   lvggt::SafetensorsWriter out(path);
   out.set_metadata("config", lvggt::to_json(config));
   out.set_metadata("origin", "untrained, by the deterministic rule");
@@ -68,6 +70,8 @@ std::int64_t write_weights(const std::string& path, const std::vector<TensorSpec
   }
   std::vector<float> buffer(static_cast<std::size_t>(largest));
   for (const TensorSpec& spec : specs) {
+    if (interrupt.requested())
+      lvggt::fail(lvggt::ErrorKind::kInterrupted, "interrupted, ", path, " is not written");
     const auto values = std::span(buffer).first(static_cast<std::size_t>(spec.volume()));
     lvggt::deterministic_values(spec.name, spec.shape, seed, values, ctx);
     out.write(spec.name, std::span<const float>(values));
@@ -106,6 +110,7 @@ int run(const Options& options) {
                 options.part, " makes no sense with it");
   if (two_files && options.decoder_output == options.output)
     lvggt::fail(lvggt::ErrorKind::kUsage, "--decoder-out names the same file as the geometry's");
+  const lvggt::cli::InterruptGuard interrupt;
   lvggt::check_output_file(options.output, options.force);
   if (two_files) lvggt::check_output_file(options.decoder_output, options.force);
 
@@ -117,10 +122,10 @@ int run(const Options& options) {
       options.part == "geometry" ? std::vector<TensorSpec>{} : lvggt::decoder_tensors(config);
   if (!two_files) specs.insert(specs.end(), decoder.begin(), decoder.end());
   report(options.output, specs.size(),
-         write_weights(options.output, specs, config, options.seed, ctx));
+         write_weights(options.output, specs, config, options.seed, interrupt, ctx));
   if (two_files)
     report(options.decoder_output, decoder.size(),
-           write_weights(options.decoder_output, decoder, config, options.seed, ctx));
+           write_weights(options.decoder_output, decoder, config, options.seed, interrupt, ctx));
   return 0;
 }
 
