@@ -15,8 +15,8 @@ inline Safetensors open_golden(const std::string& name) {
   return Safetensors::open(std::string(LVGGT_TEST_DATA) + "/golden/" + name);
 }
 
-// Swaps two axes into a dense copy with a new shape: axis order given as the source axis of each
-// new one.
+// A dense copy with the axes in another order: axis i of the copy is axis order[i] of x. The order
+// is (0, 2, 3, 1) to turn planes into channels last.
 template <int R>
 Tensor<float, R> permuted(const Tensor<float, R>& x, const std::array<int, R>& order) {
   Shape<R> shape;
