@@ -22,4 +22,9 @@ void check_ops(Comparison& comparison, lvggt::Context& ctx);
 // preprocess: image loading.
 void check_preprocess(Comparison& comparison);
 
+// The camera of a pose encoding by the reference's formulas alone: unlike decode_pose_encoding, a
+// field of view of 0 has an infinite focal length here instead of being refused.
+lvggt::Camera camera_as_encoded(lvggt::View<const float, 1> encoding, std::int64_t H,
+                                std::int64_t W);
+
 }  // namespace check_reference

@@ -2,7 +2,6 @@
 #include <algorithm>
 #include <charconv>
 #include <cmath>
-#include <limits>
 
 #include "examples/check_reference/cases.h"
 #include "examples/check_reference/recorder.h"
@@ -50,17 +49,10 @@ Tensor<float, 4> input_frames(Comparison& comparison, Context& ctx) {
   return deterministic_images(seed, predicted->shape[0], predicted->shape[2], predicted->shape[3]);
 }
 
-// Extrinsics [3,4] and intrinsics [3,3] of a pose encoding; what has no focal length is infinite or
-// NaN, as in the reference.
-void add_camera(Recorder& recorder, const std::string& prefix, View<const float, 1> encoding,
-                const FrameGeometry& geometry, Camera& camera) {
-  const float nan = std::numeric_limits<float>::quiet_NaN();
-  try {
-    camera = decode_pose_encoding(encoding, geometry.H, geometry.W);
-  } catch (const Error&) {
-    camera.cam_from_world.setConstant(nan);
-    camera.fx = camera.fy = nan;
-  }
+// Extrinsics [3,4] and intrinsics [3,3] of a pose encoding.
+Camera add_camera(Recorder& recorder, const std::string& prefix, View<const float, 1> encoding,
+                  const FrameGeometry& geometry) {
+  const Camera camera = camera_as_encoded(encoding, geometry.H, geometry.W);
   std::vector<float> extrinsics;
   for (int row = 0; row < 3; ++row)
     for (int column = 0; column < 4; ++column)
@@ -68,6 +60,7 @@ void add_camera(Recorder& recorder, const std::string& prefix, View<const float,
   recorder.add(prefix + ".extrinsics", extrinsics);
   recorder.add(prefix + ".intrinsics",
                std::vector<float>{camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1});
+  return camera;
 }
 
 // The camera head on one frame alone, and what follows from its camera.
@@ -78,8 +71,8 @@ void add_uncached_camera(Recorder& recorder, const LangVggt& model,
   Tensor<float, 3> encodings(Shape{head.num_iterations, std::int64_t{1}, kPoseEncodingSize});
   camera_head_alone(encodings, camera_token, head, ctx);
   recorder.add("cam.nocache.pose_enc", std::as_const(encodings).view());
-  Camera camera;
-  add_camera(recorder, "cam.nocache", encodings[head.num_iterations - 1][0], geometry, camera);
+  const Camera camera =
+      add_camera(recorder, "cam.nocache", encodings[head.num_iterations - 1][0], geometry);
   Tensor<float, 3> points(Shape{geometry.H, geometry.W, std::int64_t{3}});
   unproject(points, depth, camera, ctx);
   recorder.add("unprojected", std::as_const(points).view());
@@ -192,8 +185,7 @@ void check_stream(Comparison& comparison, const LoadOptions& load, Storage cache
     const Frame frame = stream.push(images[s], &recorder);
     frames_attended.push_back(frame.frames_attended);
     add_frame(recorder, frame);
-    Camera camera;
-    add_camera(recorder, "cam.cached", frame.pose_encoding, geometry, camera);
+    add_camera(recorder, "cam.cached", frame.pose_encoding, geometry);
     const View<const float, 2> token(recorder.camera_tokens().data() + s * width,
                                      Shape{std::int64_t{1}, width});
     add_uncached_camera(recorder, model, token, geometry, frame.depth, ctx);

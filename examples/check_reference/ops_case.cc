@@ -314,7 +314,7 @@ void check_cameras(const Operands& o, Comparison& comparison) {
   if (unprojects)
     points = Tensor<float, 4>(Shape{N, depth.extent(1), depth.extent(2), std::int64_t{3}});
   for (std::int64_t n = 0; n < N; ++n) {
-    const Camera camera = decode_pose_encoding(encodings[n], size[0], size[1]);
+    const Camera camera = camera_as_encoded(encodings[n], size[0], size[1]);
     for (int row = 0; row < 3; ++row)
       for (int column = 0; column < 4; ++column)
         extrinsics(n, row, column) = camera.cam_from_world(row, column);
