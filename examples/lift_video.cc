@@ -60,8 +60,9 @@ RunFormat run_format(const LiftOptions& options, const Input& input, const Model
   format.has_rgb = decoder && config.sbd_rgb;
   format.names_are_files = input.next->name != concat("frame ", input.next->source_index);
   format.expected_frames = input.source->expected_frames();
-  format.title = concat(std::filesystem::path(options.video).filename().string(), "   ",
-                        input.transform.width, " x ", input.transform.height, " pixels");
+  const std::filesystem::path path(cli::without_trailing_slashes(options.video));
+  format.title = concat(path.filename().string(), "   ", input.transform.width, " x ",
+                        input.transform.height, " pixels");
   format.footer =
       "depth and confidence: blue low, red high; semantics: one basis for the whole video";
   return format;
@@ -93,11 +94,19 @@ class Lift {
         input_.next = input_.source->next();
       }
     } catch (...) {
-      if (writer_) finish();
+      // What went wrong first is what the user has to know.
+      try {
+        if (writer_) finish();
+      } catch (const Error& error) {
+        say(error.what());
+      }
       throw;
     }
     if (writer_) finish();
   }
+
+  // Whether there is a folder to put the record of the run into.
+  bool has_folder() const { return writer_.has_value(); }
 
  private:
   // One frame from picture to files; false when interrupted before its files are complete.
@@ -155,8 +164,9 @@ class Lift {
 
 // Says how the run ended, in run.json, on stderr and in the exit status. A run is interrupted when
 // frames are left: one asked to stop after the last is complete.
-int conclude(const LiftOptions& options, const Input& input, const Times& times, bool interrupted,
+int conclude(const LiftOptions& options, const Input& input, const Times& times, bool has_folder,
              cli::RunRecord& record) {
+  const bool interrupted = input.next.has_value();
   for (const std::string& warning : input.source->warnings()) {
     record.warnings.push_back(warning);
     say("warning: " + warning);
@@ -166,7 +176,7 @@ int conclude(const LiftOptions& options, const Input& input, const Times& times,
                   : input.source->report().partial ? "partial"
                                                    : "complete";
   const std::string text = run_json(record);
-  if (record.frames > 0) write_file(options.out + "/" + cli::kRunFile, text);
+  if (has_folder) write_file(options.out + "/" + cli::kRunFile, text);
   if (options.summary == "-")
     std::fputs(text.c_str(), stdout);
   else if (!options.summary.empty())
@@ -264,10 +274,14 @@ int lift(LiftOptions& options, int argc, char** argv) {
     record.status = "failed";
     record.error = error.what();
     record.seconds = times.named();
-    if (record.frames > 0) write_file(options.out + "/" + cli::kRunFile, run_json(record));
+    try {
+      if (run.has_folder()) write_file(options.out + "/" + cli::kRunFile, run_json(record));
+    } catch (const Error& also) {
+      say(also.what());
+    }
     throw;
   }
-  return conclude(options, input, times, input.next.has_value(), record);
+  return conclude(options, input, times, run.has_folder(), record);
 }
 
 }  // namespace

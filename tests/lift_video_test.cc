@@ -390,6 +390,7 @@ TEST_CASE("D09: a disk that is full ends the run with status 1 and leaves no cut
   INFO(result.err);
   CHECK(result.status == 1);
   CHECK(result.says("points/000000.ply"));
+  CHECK(scene.status() == "failed");
   for (const auto& [name, bytes] : contents(scene / "out"))
     CHECK(name.find("000000.ply") == std::string::npos);
 }
