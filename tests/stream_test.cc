@@ -52,14 +52,21 @@ TEST_CASE("Stream: from the second frame on, push does not touch the heap") {
   StreamOptions options;
   options.points = true;
   options.max_past_frames = 3;
-  Stream stream(tiny.model, tiny.ctx, options);
   const Tensor<float, 4> images = deterministic_images(1, 8, 56, 84);
-  stream.push(images[0]);
-  for (std::int64_t f = 1; f < 8; ++f) {
-    const std::int64_t before = num_allocations();
-    stream.push(images[f]);
-    CHECK_MESSAGE(num_allocations() == before, "frame ", f, ": ", num_allocations() - before,
-                  " allocations");
+  for (const int threads : {1, 3}) {
+    CAPTURE(threads);
+    Context ctx(threads);
+    Stream stream(tiny.model, ctx, options);
+    stream.push(images[0]);
+    int frames_that_allocate = 0;
+    for (std::int64_t f = 1; f < 8; ++f) {
+      const std::int64_t before = num_allocations();
+      stream.push(images[f]);
+      if (num_allocations() != before) ++frames_that_allocate;
+    }
+    // oneTBB allocates once for each worker, when that first finds work: on a busy machine maybe
+    // late.
+    CHECK(frames_that_allocate <= threads - 1);
   }
 }
 
