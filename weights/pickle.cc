@@ -1,11 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "weights/pickle.h"
 
-#include <array>
 #include <bit>
 #include <cstring>
 #include <optional>
-#include <unordered_map>
 
 #include "lvggt/core/error.h"
 #include "weights/pickle_machine.h"
@@ -122,7 +120,7 @@ std::string op_text(std::uint8_t op) {
   return text;
 }
 
-// Instructions that push one value or work on the memo. False when `op` is none of them.
+// Instructions that push one plain value. False when `op` is none of them.
 bool run_value(std::uint8_t op, Operands& in, PickleMachine& machine) {
   switch (op) {
     case kNone:
@@ -153,6 +151,15 @@ bool run_value(std::uint8_t op, Operands& in, PickleMachine& machine) {
       in.big_endian_double();
       machine.push_plain(PickleKind::kReal, 0);
       return true;
+    default:
+      return false;
+  }
+}
+
+// Instructions that push text, an empty container, or something from the memo. False when `op` is
+// none of them.
+bool run_container(std::uint8_t op, Operands& in, PickleMachine& machine) {
+  switch (op) {
     case kBinUnicode:
       machine.push_string(in.take(in.number<std::uint32_t>()));
       return true;
@@ -261,7 +268,8 @@ Pickle read_pickle(std::string_view bytes, const std::string& source) {
         machine.unsupported(concat("pickle protocol ", protocol));
     } else if (op == kFrame) {
       in.number<std::uint64_t>();  // only says how much follows
-    } else if (!run_value(op, in, machine) && !run_combination(op, in, machine)) {
+    } else if (!run_value(op, in, machine) && !run_container(op, in, machine) &&
+               !run_combination(op, in, machine)) {
       machine.unsupported("the instruction " + op_text(op));
     }
   }
