@@ -77,7 +77,13 @@ TEST_CASE("B24: configurations that are not a flat JSON object of the right type
   message_of(R"({"taps": [1, 2, 3]})", ErrorKind::kFormat);
   message_of(R"({"sbd_head": "cnn"})", ErrorKind::kFormat);
   CHECK(contains(message_of(R"({"seed": 1, "seed": 2})", ErrorKind::kFormat), "twice"));
-  message_of(std::string(100000, '['), ErrorKind::kFormat);
+  message_of(std::string(100000, '['), ErrorKind::kLimit);
+  message_of("\xEF\xBB\xBF{}", ErrorKind::kFormat);
+  message_of(R"({"embed_dim": true})", ErrorKind::kFormat);
+  message_of(R"({"sbd_rgb": 1})", ErrorKind::kFormat);
+  CHECK(
+      lvggt::parse_config("{\r\n\"embed_dim\": 64,\r\n\"agg_heads\": 4\r\n}", "c.json").embed_dim ==
+      64);
   message_of(std::string(2000000, ' '), ErrorKind::kLimit);
 }
 

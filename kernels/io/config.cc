@@ -3,24 +3,21 @@
 
 #include <algorithm>
 #include <cmath>
-#include <fstream>
-#include <iterator>
-#include <nlohmann/json.hpp>
 #include <numeric>
-#include <set>
+#include <utility>
 #include <vector>
 
 #include "lvggt/core/error.h"
+#include "lvggt/io/json.h"
+#include "lvggt/io/json_writer.h"
 #include "lvggt/model/checkpoint.h"
 
 namespace lvggt {
 namespace {
 
-using Json = nlohmann::ordered_json;
-
 constexpr std::size_t kMaxConfigBytes = std::size_t{1} << 20;
-constexpr std::int64_t kMaxExtent = 1
-                                    << 20;  // of any one size, so that no product of four overflows
+// Of any one size: the product of three stays within 64 bits.
+constexpr std::int64_t kMaxExtent = 1 << 20;
 constexpr std::int64_t kMaxDepth = 1000;
 
 // Lists every field once, for reading and for writing.
@@ -67,15 +64,38 @@ void for_each_field(Config& c, Visit&& visit) {
   visit("bn_momentum", c.bn_momentum);
 }
 
-// Options of the published code that are implemented with one value only, and that value.
-const std::vector<std::pair<std::string, Json>>& fixed_options() {
-  static const std::vector<std::pair<std::string, Json>> options = {{"interpolate_antialias", true},
-                                                                    {"interpolate_offset", 0.0},
-                                                                    {"depth_activation", "exp"},
-                                                                    {"point_activation", "inv_log"},
-                                                                    {"conf_activation", "expp1"}};
-  return options;
+// Values as JSON.
+template <class Number>
+requires(std::integral<Number> || std::floating_point<Number>) std::string text_of(Number value) {
+  std::string text;
+  append_number(text, value);
+  return text;
 }
+std::string text_of(bool value) { return value ? "true" : "false"; }
+std::string text_of(const std::string& value) { return json_quote(value); }
+std::string text_of(DecoderHead value) {
+  return value == DecoderHead::kUnet ? "\"unet\"" : "\"mlp\"";
+}
+template <class T, std::size_t N>
+std::string text_of(const std::array<T, N>& values) {
+  std::string text;
+  for (const T& value : values) text += (text.empty() ? "[" : ", ") + text_of(value);
+  return text + "]";
+}
+std::string text_of(const Json& value) {
+  if (value.is_bool()) return text_of(value.as_bool(""));
+  if (value.is_integer()) return text_of(value.as_int64(""));
+  if (value.is_number()) return text_of(value.as_double(""));
+  if (value.is_string()) return text_of(value.as_string("").substr(0, 60));
+  return std::string(value.kind_name());
+}
+
+// Options of the published code that are implemented with one value only, and that value as JSON.
+constexpr std::pair<const char*, const char*> kFixedOptions[] = {
+    {"interpolate_antialias", "true"}, {"interpolate_offset", "0"},
+    {"depth_activation", "\"exp\""},   {"point_activation", "\"inv_log\""},
+    {"conf_activation", "\"expp1\""},
+};
 
 bool describes_only(std::string_view key) {
   return key == "seed" || key.starts_with("ae_") || key.ends_with("_init_values");
@@ -104,49 +124,43 @@ class FieldReader {
   template <class Field>
   void operator()(const char* key, Field& field) {
     known_.emplace_back(key);
-    const auto found = object_.find(key);
-    if (found != object_.end()) read(key, *found, field);
+    if (const Json* value = object_.find(key)) read(key, *value, field);
   }
   const std::vector<std::string>& known() const { return known_; }
 
  private:
   [[noreturn]] void wrong(const char* key, const Json& value, const char* wanted) const {
-    fail(ErrorKind::kFormat, source_, ": \"", key, "\" must be ", wanted, ", not ",
-         value.dump().substr(0, 60));
+    fail(ErrorKind::kFormat, source_, ": \"", key, "\" must be ", wanted, ", not ", text_of(value));
   }
   void read(const char* key, const Json& value, std::int64_t& field) const {
-    // An unsigned number above 2^63 would turn negative.
-    if (!value.is_number_integer() ||
-        (value.is_number_unsigned() && value.get<std::uint64_t>() > std::uint64_t{INT64_MAX}))
-      wrong(key, value, "an integer");
-    field = value.get<std::int64_t>();
+    if (!value.is_integer()) wrong(key, value, "an integer");
+    field = value.as_int64(key);
   }
   void read(const char* key, const Json& value, double& field) const {
     if (!value.is_number()) wrong(key, value, "a number");
-    field = value.get<double>();
+    field = value.as_double(key);
   }
   void read(const char* key, const Json& value, bool& field) const {
-    if (!value.is_boolean()) wrong(key, value, "true or false");
-    field = value.get<bool>();
+    if (!value.is_bool()) wrong(key, value, "true or false");
+    field = value.as_bool(key);
   }
   void read(const char* key, const Json& value, std::string& field) const {
     if (!value.is_string()) wrong(key, value, "a string");
-    field = value.get<std::string>();
+    field = value.as_string(key);
   }
   void read(const char* key, const Json& value, DecoderHead& field) const {
-    if (value == "unet") {
-      field = DecoderHead::kUnet;
-    } else if (value == "mlp") {
-      field = DecoderHead::kMlp;
-    } else {
-      wrong(key, value, "\"unet\" or \"mlp\"");
+    for (const DecoderHead head : {DecoderHead::kUnet, DecoderHead::kMlp}) {
+      if (text_of(value) != text_of(head)) continue;
+      field = head;
+      return;
     }
+    wrong(key, value, "\"unet\" or \"mlp\"");
   }
   template <class T, std::size_t N>
   void read(const char* key, const Json& value, std::array<T, N>& field) const {
-    if (!value.is_array() || value.size() != N)
+    if (!value.is_array() || value.as_array(key).size() != N)
       wrong(key, value, N == 3 ? "a list of 3 values" : "a list of 4 values");
-    for (std::size_t i = 0; i < N; ++i) read(key, value[i], field[i]);
+    for (std::size_t i = 0; i < N; ++i) read(key, value.as_array(key)[i], field[i]);
   }
 
   const Json& object_;
@@ -156,14 +170,14 @@ class FieldReader {
 
 void refuse_unknown_keys(const Json& object, std::vector<std::string> known,
                          std::string_view source) {
-  for (const auto& [key, value] : fixed_options()) {
-    known.push_back(key);
-    if (object.contains(key) && object.at(key) != value)
-      fail(ErrorKind::kUnsupported, source, ": \"", key, "\" is ", object.at(key).dump(),
-           ", but only ", value.dump(), " is implemented");
+  for (const auto& [key, implemented] : kFixedOptions) {
+    known.emplace_back(key);
+    const Json* value = object.find(key);
+    if (value != nullptr && text_of(*value) != implemented)
+      fail(ErrorKind::kUnsupported, source, ": \"", key, "\" is ", text_of(*value), ", but only ",
+           implemented, " is implemented");
   }
-  for (const auto& item : object.items()) {
-    const std::string& key = item.key();
+  for (const auto& [key, value] : object.as_object(source)) {
     if (describes_only(key) || std::find(known.begin(), known.end(), key) != known.end()) continue;
     const std::string_view shown = std::string_view(key).substr(0, 100);
     const auto nearest =
@@ -173,30 +187,6 @@ void refuse_unknown_keys(const Json& object, std::vector<std::string> known,
     fail(ErrorKind::kFormat, source, ": unknown key \"", shown, "\" (the nearest known key is \"",
          *nearest, "\")");
   }
-}
-
-Json parse_object(std::string_view text, std::string_view source) {
-  if (text.size() > kMaxConfigBytes)
-    fail(ErrorKind::kLimit, source, ": a configuration may have at most ", kMaxConfigBytes,
-         " bytes, this has ", text.size());
-  std::set<std::string> keys;
-  const auto check = [&](int depth, Json::parse_event_t event, Json& parsed) {
-    if (depth > 4) fail(ErrorKind::kFormat, source, ": a configuration is a flat JSON object");
-    if (event == Json::parse_event_t::key && depth == 1 &&
-        !keys.insert(parsed.get<std::string>()).second)
-      fail(ErrorKind::kFormat, source, ": key ", parsed.dump(), " is given twice");
-    return true;
-  };
-  Json object;
-  try {
-    object = Json::parse(text, check);
-  } catch (const Json::exception& e) {
-    fail(ErrorKind::kFormat, source, ": not valid JSON (", e.what(), ")");
-  }
-  if (!object.is_object())
-    fail(ErrorKind::kFormat, source, ": a configuration is a JSON object, this is ",
-         object.type_name());
-  return object;
 }
 
 struct Range {
@@ -274,8 +264,12 @@ void validate_config(const ModelConfig& c, std::string_view source) {
       c.taps[0], ", ", c.taps[1], ", ", c.taps[2], ", ", c.taps[3], "]");
 }
 
-ModelConfig parse_config(std::string_view json, std::string_view source) {
-  const Json object = parse_object(json, source);
+namespace {
+
+ModelConfig config_of(const Json& object, std::string_view source) {
+  if (!object.is_object())
+    fail(ErrorKind::kFormat, source, ": a configuration is a JSON object, this is ",
+         object.kind_name());
   ModelConfig config;
   FieldReader reader(object, source);
   for_each_field(config, reader);
@@ -284,46 +278,47 @@ ModelConfig parse_config(std::string_view json, std::string_view source) {
   return config;
 }
 
-ModelConfig load_config(const std::string& path) {
-  std::ifstream file(path, std::ios::binary);
-  if (!file) fail(ErrorKind::kRead, path, ": cannot be opened");
-  std::string text(kMaxConfigBytes + 1, '\0');
-  file.read(text.data(), static_cast<std::streamsize>(text.size()));
-  if (file.bad()) fail(ErrorKind::kRead, path, ": cannot be read");
-  text.resize(static_cast<std::size_t>(file.gcount()));
-  if (text.empty()) fail(ErrorKind::kFormat, path, ": empty, where a configuration was expected");
-  return parse_config(text, path);
-}
+using Fields = std::vector<std::pair<std::string, std::string>>;  // key, value as JSON
 
-namespace {
-
-Json json_of(const ModelConfig& config) {
-  Json object;
+Fields fields_of(const ModelConfig& config) {
+  Fields fields;
   for_each_field(config, [&](const char* key, const auto& field) {
-    if constexpr (std::is_same_v<std::remove_cvref_t<decltype(field)>, DecoderHead>) {
-      object[key] = field == DecoderHead::kUnet ? "unet" : "mlp";
-    } else {
-      object[key] = field;
-    }
+    fields.emplace_back(key, text_of(field));
   });
-  return object;
+  return fields;
 }
 
 }  // namespace
 
+ModelConfig parse_config(std::string_view json, std::string_view source) {
+  if (json.size() > kMaxConfigBytes)
+    fail(ErrorKind::kLimit, source, ": a configuration may have at most ", kMaxConfigBytes,
+         " bytes, this has ", json.size());
+  return config_of(Json::parse(json, std::string(source)), source);
+}
+
+ModelConfig load_config(const std::string& path) {
+  Limits limits;
+  limits.json_bytes = kMaxConfigBytes;
+  return config_of(Json::read(path, limits), path);
+}
+
 std::string to_json(const ModelConfig& config) {
-  Json object = json_of(config);
-  for (const auto& [key, value] : fixed_options()) object[key] = value;
-  return object.dump(1);
+  Fields fields = fields_of(config);
+  for (const auto& [key, value] : kFixedOptions) fields.emplace_back(key, value);
+  std::string text;
+  for (const auto& [key, value] : fields)
+    text += (text.empty() ? "{\n \"" : ",\n \"") + key + "\": " + value;
+  return text + "\n}";
 }
 
 std::string config_difference(const ModelConfig& found, const ModelConfig& expected) {
-  const Json found_json = json_of(found), other = json_of(expected);
+  const Fields ours = fields_of(found), theirs = fields_of(expected);
   std::string text;
-  for (const auto& item : found_json.items())
-    if (item.key() != "name" && item.value() != other.at(item.key()))
-      text += (text.empty() ? "" : "; ") + item.key() + " is " + item.value().dump() + ", not " +
-              other.at(item.key()).dump();
+  for (std::size_t i = 0; i < ours.size(); ++i)
+    if (ours[i].first != "name" && ours[i].second != theirs[i].second)
+      text += (text.empty() ? "" : "; ") + ours[i].first + " is " + ours[i].second + ", not " +
+              theirs[i].second;
   return text;
 }
 
