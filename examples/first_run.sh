@@ -4,8 +4,9 @@
 # of a small model and lifts the bundled clip.
 #   bash examples/first_run.sh [FOLDER]      FOLDER: where the results go, out/first_run unless given
 set -euo pipefail
-out=$(realpath -m "${1:-$(dirname "${BASH_SOURCE[0]}")/../out/first_run}")
+out=${1:+$(realpath -m "$1")}
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
+out=${out:-out/first_run}
 
 bash tests/setup.sh
 if command -v ccache >/dev/null; then
