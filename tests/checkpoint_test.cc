@@ -208,7 +208,7 @@ TEST_CASE(
     t.values[3] = NAN;
     t.values[5] = -INFINITY;
   }));
-  const std::string message = files.refusal(ErrorKind::kNumeric);
+  const std::string message = files.refusal(ErrorKind::kFormat);
   CHECK(contains(message, "camera_head.trunk_norm.bias"));
   CHECK(contains(message, "2 values"));
   files.options.allow_nonfinite = true;

@@ -105,7 +105,7 @@ TEST_CASE(
   const auto check = [&](const ConvertOptions& options, const char* says) {
     const Outcome outcome = outcome_of([&] { convert(dir / "in", dir / "out", options); });
     CAPTURE(outcome.message);
-    CHECK(outcome.kind == ErrorKind::kNumeric);
+    CHECK(outcome.kind == ErrorKind::kFormat);
     CHECK(outcome.says("tensor 'w'"));
     CHECK(outcome.says(says));
     CHECK_FALSE(std::filesystem::exists(dir / "out"));

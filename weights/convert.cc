@@ -28,7 +28,7 @@ struct Buffers {
 
 void check_finite(const TensorEntry& tensor, const ValueSummary& summary, const char* when) {
   if (summary.finite()) return;
-  fail(ErrorKind::kNumeric, "tensor '", tensor.name, "' has ", summary.nan, " NaN and ",
+  fail(ErrorKind::kFormat, "tensor '", tensor.name, "' has ", summary.nan, " NaN and ",
        summary.infinite, " infinite values among ", summary.size, when,
        "; --allow-nonfinite accepts them");
 }

@@ -30,7 +30,7 @@ struct ConvertResult {
 
 // Writes the tensors of `source` under their own names to one safetensors file, one at a time, with
 // every value checked on the way. A value that is NaN or infinite, or becomes so in the output's
-// type, is a kNumeric Error that names the tensor.
+// type, is a kFormat Error that names the tensor.
 ConvertResult convert_weights(WeightSource& source, const std::string& output,
                               const ConvertOptions& options);
 

@@ -27,7 +27,7 @@ constexpr const char* kFooter =
     "  weights_convert checkpoints.pth streamvggt.safetensors\n"
     "  weights_convert --dtype bf16 --drop track_head. model.pt vggt.safetensors\n"
     "  weights_convert --config decoder.json decoder.pth decoder.safetensors\n\n"
-    "Exit status: 0 done, 1 failed at run time (NaN in the weights, full disk), 2 wrong usage, 3 "
+    "Exit status: 0 done, 1 failed at run time (full disk), 2 wrong usage, 3 "
     "bad input file,\n"
     "4 memory or a limit.";
 

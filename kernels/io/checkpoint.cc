@@ -253,7 +253,7 @@ void Checkpoint::inspect(const std::string& name, const Safetensors& file,
   }
   denormal -= zero;
   if (nonfinite > 0 && !allow_nonfinite_)
-    fail(ErrorKind::kNumeric, file.path(), ": tensor ", name, " has ", nonfinite, " values of ",
+    fail(ErrorKind::kFormat, file.path(), ": tensor ", name, " has ", nonfinite, " values of ",
          values.size(), " that are NaN or infinite");
   const std::lock_guard lock(mutex_);
   if (nonfinite > 0) nonfinite_.push_back(name);

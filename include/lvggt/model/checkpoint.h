@@ -56,7 +56,7 @@ class Checkpoint {
   bool has_decoder() const { return has_decoder_; }
   bool has_point_head() const { return has_point_head_; }
 
-  // One tensor, widened to float. Throws kNumeric when a value is not finite, unless that is
+  // One tensor, widened to float. Throws kFormat when a value is not finite, unless that is
   // allowed. May be called by several threads at once.
   template <int R>
   Tensor<float, R> read(const std::string& name) const {

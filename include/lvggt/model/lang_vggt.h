@@ -21,7 +21,7 @@ class LangVggt {
  public:
   // Checks every name and shape before any tensor is read and packs tensor by tensor, so that the
   // peak is the packed model and one tensor a thread. Throws kMismatch with all missing and
-  // misshapen tensors, kNumeric for weights that are not finite, and what Safetensors::open and
+  // misshapen tensors, kFormat for weights that are not finite, and what Safetensors::open and
   // load_config throw.
   static LangVggt load(const LoadOptions& options, Context& ctx) {
     const Checkpoint checkpoint(options);
