@@ -19,6 +19,7 @@
 struct LiftOptions {
   std::string video, out, summary, mode = "crop", camera_cache = "stream", point_colors = "input";
   std::string weights_storage = "f32", cache_storage = "f32";
+  std::string sha256;  // of the weights file; empty: any
   lvggt::LoadOptions weights;
   lvggt::FrameSourceOptions frames;
   lvggt::PreprocessOptions preprocess;
@@ -117,6 +118,8 @@ inline void add_inputs(lvggt::cli::Program& program, LiftOptions& o) {
       ->type_name("JSON");
   app.add_flag("--no-decoder", o.no_decoder, "Geometry only, also if there is a decoder");
   app.add_flag("--strict", o.weights.strict, "Refuse weights with tensors the model does not use");
+  app.add_option("--sha256", o.sha256, "Refuse weights whose file has another SHA-256")
+      ->type_name("HEX");
   app.add_flag("--hash", o.hash, "Record the SHA-256 of the weights in run.json");
 }
 

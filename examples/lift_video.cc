@@ -12,6 +12,7 @@
 #include "lvggt/cli/output_folder.h"
 #include "lvggt/cli/progress.h"
 #include "lvggt/cli/run_record.h"
+#include "lvggt/io/hash.h"
 #include "lvggt/lvggt.h"
 #include "lvggt/model/stream.h"
 
@@ -261,6 +262,7 @@ int lift(LiftOptions& options, int argc, char** argv) {
   std::optional<LangVggt> model;
   {
     const StageTimer timer(times.load);
+    if (!options.sha256.empty()) check_sha256(options.weights.weights, options.sha256);
     model.emplace(LangVggt::load(options.weights, ctx));
   }
   record.warnings = model->warnings();

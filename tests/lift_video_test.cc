@@ -10,6 +10,7 @@
 #include <vector>
 
 #include "lvggt/core/tensor.h"
+#include "lvggt/io/hash.h"
 #include "lvggt/io/json.h"
 #include "lvggt/io/png.h"
 #include "tests/support/child_process.h"
@@ -393,4 +394,24 @@ TEST_CASE("D09: a disk that is full ends the run with status 1 and leaves no cut
   CHECK(scene.status() == "failed");
   for (const auto& [name, bytes] : contents(scene / "out"))
     CHECK(name.find("000000.ply") == std::string::npos);
+}
+
+TEST_CASE("A60: weights whose SHA-256 is not the one given are refused, and nothing is written") {
+  const Scene scene(1);
+  const Result wrong = scene.lift({"--sha256", std::string(64, 'a')});
+  CHECK(wrong.status == 3);
+  CHECK(wrong.says("model.safetensors"));
+  CHECK_FALSE(std::filesystem::exists(scene / "out"));
+  CHECK(scene.lift({"--sha256", "abc"}).status == 2);
+  CHECK(scene.lift({"--sha256", sha256_file(scene / "model.safetensors")}).status == 0);
+}
+
+TEST_CASE("lift_video: kept frames are recorded in the settings of the run") {
+  const Scene scene;
+  REQUIRE(
+      scene.lift({"--max-past-frames", "2", "--keep-first-frame", "--keep-every", "2"}).status ==
+      0);
+  const std::string run = test::read_bytes(scene / "out/run.json");
+  CHECK(run.find("\"keep_first_frame\": \"yes\"") != std::string::npos);
+  CHECK(run.find("\"keep_every\": \"2\"") != std::string::npos);
 }
