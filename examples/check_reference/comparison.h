@@ -34,7 +34,7 @@ class Comparison {
 
   // A tensor that needs no check: an input, a weight, a statement about the reference itself.
   void accept(const std::string& name) { seen_.insert(name); }
-  // A tensor of a part that is not implemented; it is listed, but fails nothing.
+  // A tensor that only training produces; it is listed, but fails nothing.
   void skip(const std::string& name);
 
   // Fails every tensor that nothing was computed for; call once, at the end.
