@@ -192,7 +192,7 @@ std::vector<TensorSpec> decoder_tensors(const ModelConfig& config) {
 }
 
 bool known_unused_tensor(std::string_view name) {
-  return name.starts_with("track_head.") || name == "aggregator.patch_embed.mask_token" ||
+  return name.starts_with("track_head.") || name.starts_with("train.") || name == "aggregator.patch_embed.mask_token" ||
          name.ends_with(".num_batches_tracked");
 }
 

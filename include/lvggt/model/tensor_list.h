@@ -38,7 +38,7 @@ std::vector<TensorSpec> decoder_tensors(const ModelConfig& config);
 std::vector<std::string> language_decoder_names(const ModelConfig& config);
 
 // What a published checkpoint may hold beyond the lists above: track_head.*, mask_token,
-// num_batches_tracked.
+// num_batches_tracked; and train.*, the optimiser's state in a checkpoint of a training.
 bool known_unused_tensor(std::string_view name);
 
 }  // namespace lvggt
