@@ -10,22 +10,9 @@
 #include <algorithm>
 #include <cmath>
 
+#include "kernels/linear_taps.h"
 #include "kernels/math-inl.h"
 #include "lvggt/core/parallel.h"
-
-#ifndef LVGGT_KERNELS_INTERPOLATE_TAPS_
-#define LVGGT_KERNELS_INTERPOLATE_TAPS_
-namespace lvggt::kernels {
-
-// Output index i of one axis is (1 - weight) * input[low] + weight * input[high].
-struct LinearTap {
-  std::int64_t low;
-  std::int64_t high;
-  float weight;
-};
-
-}  // namespace lvggt::kernels
-#endif
 
 HWY_BEFORE_NAMESPACE();
 namespace lvggt::kernels::HWY_NAMESPACE {
@@ -117,25 +104,6 @@ constexpr std::int64_t kStreamingElements = std::int64_t{1} << 23;
 
 auto bilinear_row_function() { return &HWY_DYNAMIC_DISPATCH(bilinear_row); }
 auto weighted_sum_function() { return &HWY_DYNAMIC_DISPATCH(weighted_sum); }
-
-View<LinearTap, 1> linear_taps(std::int64_t out, std::int64_t in, bool align_corners,
-                               Arena& arena) {
-  const View<LinearTap, 1> taps = arena.alloc<LinearTap>(Shape{out});
-  for (std::int64_t i = 0; i < out; ++i) {
-    double source = 0;
-    if (align_corners) {
-      if (out > 1) source = static_cast<double>(i * (in - 1)) / static_cast<double>(out - 1);
-    } else {
-      source =
-          (static_cast<double>(i) + 0.5) * static_cast<double>(in) / static_cast<double>(out) - 0.5;
-    }
-    const double position = std::clamp(source, 0.0, static_cast<double>(in - 1));
-    const auto low = static_cast<std::int64_t>(position);
-    taps[i] = {low, std::min(low + 1, in - 1),
-               static_cast<float>(position - static_cast<double>(low))};
-  }
-  return taps;
-}
 
 // Output index i of one axis is the sum over j < count[i] of weights[i][j] * input[first[i] + j].
 struct CubicTaps {

@@ -33,4 +33,17 @@ constexpr std::int64_t conv2d_extent(std::int64_t in, std::int64_t kernel, std::
 void conv2d_forward(View<float, 4> y, View<const float, 4> x, const PackedConv2d& w,
                     const Epilogue<4>& epilogue, Context& ctx);
 
+// Backward of y = conv2d(x, weight) + bias. With the loss L, dy = dL/dy, and input pixel
+// p = stride o + tap - padding of output pixel o,
+//   dx[p, ci]          = sum over o, tap, co of dy[o, co] weight[co, ci, tap]
+//   dweight[co, ci, t] += sum over o of dy[o, co] x[stride o + t - padding, ci]
+//   dbias[co]          += sum over o of dy[o, co]
+//   dx, x: [B, H, W, Cin]   dweight, weight: [Cout, Cin, k, k], as PyTorch stores it   dbias:
+//   [Cout] dy: [B, Ho, Wo, Cout]
+// An empty dx, dweight or dbias is not wanted; x may then be empty if dweight is. Rows and pixels
+// of dx, dy and x may be strided. dx may be x, but not dy.
+void conv2d_backward(View<float, 4> dx, View<float, 4> dweight, View<float, 1> dbias,
+                     View<const float, 4> dy, View<const float, 4> x, View<const float, 4> weight,
+                     std::int64_t stride, std::int64_t padding, Context& ctx);
+
 }  // namespace lvggt

@@ -28,4 +28,15 @@ void conv_transpose2d_forward(View<float, 4> y, View<const float, 4> x,
                               const PackedConvTranspose2d& w, View<const float, 1> bias,
                               Context& ctx);
 
+// Backward of conv_transpose2d_forward: it is a convolution with its input and output exchanged, so
+//   dx[i, j, ci]            = sum over ky, kx, co of dy[k i + ky, k j + kx, co] weight[ci, co, ky,
+//   kx] dweight[ci, co, ky, kx] += sum over i, j of x[i, j, ci] dy[k i + ky, k j + kx, co]
+//   dbias[co]               += sum over all pixels of dy[., ., co]
+//   dx, x: [B, H, W, Cin]   dweight, weight: [Cin, Cout, k, k]   dbias: [Cout]
+//   dy: [B, k*H, k*W, Cout]
+// An empty dx, dweight or dbias is not wanted; pixels may be strided.
+void conv_transpose2d_backward(View<float, 4> dx, View<float, 4> dweight, View<float, 1> dbias,
+                               View<const float, 4> dy, View<const float, 4> x,
+                               View<const float, 4> weight, Context& ctx);
+
 }  // namespace lvggt

@@ -9,6 +9,11 @@ namespace lvggt {
 // y = a + b.   y, a, b: [N, C], rows may be strided.   y may be a or b.
 void add(View<float, 2> y, View<const float, 2> a, View<const float, 2> b, Context& ctx);
 
+// dx += dx_other: the gradients of two consumers of x.   both: [N, C], rows may be strided.
+inline void accumulate(View<float, 2> dx, View<const float, 2> dx_other, Context& ctx) {
+  add(dx, dx, dx_other, ctx);
+}
+
 // y = gate * (x * (1 + scale) + shift) + t: the adaptive LayerNorm of the camera head.
 //   all: [N, C], rows may be strided.   y may be x or t.
 void modulate(View<float, 2> y, View<const float, 2> x, View<const float, 2> shift,

@@ -1,0 +1,181 @@
+// SPDX-License-Identifier: Apache-2.0
+// Backward passes of the three layers that are products: conv2d, conv_transpose2d, linear.
+#include <algorithm>
+
+#include "kernels/pack.h"
+#include "kernels/product.h"
+#include "kernels/weight_gradient.h"
+#include "lvggt/kernels/conv2d.h"
+#include "lvggt/kernels/conv_transpose2d.h"
+#include "lvggt/kernels/linear.h"
+
+namespace lvggt {
+namespace {
+
+// One axis of the input gradient. Output o reads input p = stride o + tap - padding, so input p
+// gets gradients from the taps t = (p + padding) mod stride, + stride, + 2 stride, ... only: from
+// output (p + padding - t) / stride each. All p of the same residue ("phase") have the same taps.
+struct Phase {
+  std::int64_t first_tap;  // below stride
+  std::int64_t taps;       // first_tap, first_tap + stride, ...
+  std::int64_t inputs;     // p = phase, phase + stride, ...
+};
+Phase phase_of(std::int64_t phase, std::int64_t extent, std::int64_t kernel, std::int64_t stride,
+               std::int64_t padding) {
+  const std::int64_t first = (phase + padding) % stride;
+  return {first, std::max<std::int64_t>(0, (kernel - first + stride - 1) / stride),
+          std::max<std::int64_t>(0, (extent - phase + stride - 1) / stride)};
+}
+
+// The input gradient of the pixels of one phase of each axis: a convolution of dy with stride 1.
+class InputGradient {
+ public:
+  InputGradient(View<float, 4> dx, View<const float, 4> dy, View<const float, 4> weight,
+                std::int64_t stride, std::int64_t padding, Context& ctx)
+      : dx_(dx), dy_(dy), weight_(weight), stride_(stride), padding_(padding) {
+    zeros_ = ctx.arena().alloc(Shape{dy.extent(3)});
+    std::fill_n(zeros_.data(), dy.extent(3), 0.0f);
+  }
+
+  void run(std::int64_t phase_y, std::int64_t phase_x, Context& ctx) const {
+    const std::int64_t kernel = weight_.extent(2);
+    const Phase down = phase_of(phase_y, dx_.extent(1), kernel, stride_, padding_);
+    const Phase across = phase_of(phase_x, dx_.extent(2), kernel, stride_, padding_);
+    const std::int64_t M = dx_.extent(0) * down.inputs * across.inputs;
+    if (M == 0) return;
+    const PackedMatrix w = packed(down, across);
+    const kernels::Product product{M, &w, w.taps, w.K, nullptr, Activation::kNone, nullptr, false};
+    const auto gather = [&](const kernels::RowTable& table) {
+      for (std::int64_t r = 0; r < table.count; ++r) {
+        const std::int64_t m = table.begin + r;
+        const std::int64_t ix = phase_x + m % across.inputs * stride_;
+        const std::int64_t iy = phase_y + m / across.inputs % down.inputs * stride_;
+        const std::int64_t b = m / across.inputs / down.inputs;
+        table.y[r] = dx_.data() + b * dx_.stride(0) + iy * dx_.stride(1) + ix * dx_.stride(2);
+        for (std::int64_t t = 0; t < w.taps; ++t)
+          table.x[t * table.capacity + r] = pixel(b, iy + padding_ - tap(down, t / across.taps),
+                                                  ix + padding_ - tap(across, t % across.taps));
+      }
+    };
+    kernels::run_product(product, gather, ctx);
+  }
+
+ private:
+  std::int64_t tap(const Phase& phase, std::int64_t i) const {
+    return phase.first_tap + i * stride_;
+  }
+
+  // The phase's taps, input and output channels exchanged.
+  PackedMatrix packed(const Phase& down, const Phase& across) const {
+    const std::int64_t Cout = weight_.extent(0), Cin = weight_.extent(1);
+    // Without a tap nothing reads these pixels: a tap of zero weights gives them gradient 0.
+    const std::int64_t taps = std::max<std::int64_t>(1, down.taps * across.taps);
+    PackedMatrix matrix = kernels::empty_matrix(Cin, taps, Cout, Storage::kF32);
+    for (std::int64_t t = 0; t < down.taps * across.taps; ++t)
+      for (std::int64_t co = 0; co < Cout; ++co)
+        for (std::int64_t ci = 0; ci < Cin; ++ci)
+          kernels::set_weight(
+              matrix, ci, t * Cout + co,
+              weight_(co, ci, tap(down, t / across.taps), tap(across, t % across.taps)));
+    return matrix;
+  }
+
+  // y and x are multiples of the stride.
+  const float* pixel(std::int64_t b, std::int64_t y, std::int64_t x) const {
+    if (y < 0 || x < 0 || y / stride_ >= dy_.extent(1) || x / stride_ >= dy_.extent(2))
+      return zeros_.data();
+    return dy_.data() + b * dy_.stride(0) + y / stride_ * dy_.stride(1) +
+           x / stride_ * dy_.stride(2);
+  }
+
+  View<float, 4> dx_;
+  View<const float, 4> dy_;
+  View<const float, 4> weight_;
+  std::int64_t stride_;
+  std::int64_t padding_;
+  View<float, 1> zeros_;
+};
+
+// [M, C] as [1, 1, M, C]
+template <class T>
+View<T, 4> as_map(View<T, 2> rows) {
+  if (rows.empty()) return {};
+  const std::int64_t M = rows.extent(0), C = rows.extent(1);
+  return View<T, 4>(rows.data(), Shape{std::int64_t{1}, std::int64_t{1}, M, C},
+                    {M * rows.stride(0), M * rows.stride(0), rows.stride(0), 1});
+}
+
+// [N, K] as [N, K, 1, 1]
+template <class T>
+View<T, 4> as_filters(View<T, 2> weight) {
+  if (weight.empty()) return {};
+  return View<T, 4>(weight.data(),
+                    Shape{weight.extent(0), weight.extent(1), std::int64_t{1}, std::int64_t{1}},
+                    {weight.stride(0), 1, 1, 1});
+}
+
+}  // namespace
+
+void conv2d_backward(View<float, 4> dx, View<float, 4> dweight, View<float, 1> dbias,
+                     View<const float, 4> dy, View<const float, 4> x, View<const float, 4> weight,
+                     std::int64_t stride, std::int64_t padding, Context& ctx) {
+  const auto [Cout, Cin, kernel, kernel_x] = weight.shape();
+  LVGGT_CHECK(kernel == kernel_x, "conv2d_backward: weight ", weight.shape(),
+              " does not have a square kernel");
+  const auto check_input = [&](const char* name, const Shape<4>& shape) {
+    const Shape expected{shape[0], conv2d_extent(shape[1], weight.extent(2), stride, padding),
+                         conv2d_extent(shape[2], weight.extent(2), stride, padding),
+                         weight.extent(0)};
+    LVGGT_CHECK(shape[3] == weight.extent(1) && dy.shape() == expected, "conv2d_backward: dy is ",
+                dy.shape(), " but ", name, " ", shape, " and the weight ", weight.shape(), " give ",
+                expected);
+  };
+  if (dx) check_input("dx", dx.shape());
+  if (dweight) check_input("x", x.shape());
+  LVGGT_CHECK(dweight.empty() || dweight.shape() == weight.shape(), "conv2d_backward: dweight is ",
+              dweight.shape(), " but the weight is ", weight.shape());
+  LVGGT_CHECK(dbias.empty() || dbias.extent(0) == dy.extent(3), "conv2d_backward: dbias is ",
+              dbias.shape(), " but dy is ", dy.shape());
+  if (dweight) kernels::weight_gradient(dweight, dy, x, stride, padding, ctx);
+  if (dbias) kernels::bias_gradient(dbias, dy, ctx);
+  if (dx.empty()) return;
+  Arena::Scope scope(ctx.arena());
+  const InputGradient gradient(dx, dy, weight, stride, padding, ctx);
+  for (std::int64_t phase = 0; phase < stride * stride; ++phase)
+    gradient.run(phase / stride, phase % stride, ctx);
+}
+
+void conv_transpose2d_backward(View<float, 4> dx, View<float, 4> dweight, View<float, 1> dbias,
+                               View<const float, 4> dy, View<const float, 4> x,
+                               View<const float, 4> weight, Context& ctx) {
+  const std::int64_t k = weight.extent(2);
+  LVGGT_CHECK(k == weight.extent(3), "conv_transpose2d_backward: weight ", weight.shape(),
+              " does not have a square kernel");
+  const auto check_input = [&](const char* name, const Shape<4>& shape) {
+    const Shape expected{shape[0], k * shape[1], k * shape[2], weight.extent(1)};
+    LVGGT_CHECK(shape[3] == weight.extent(0) && dy.shape() == expected,
+                "conv_transpose2d_backward: dy is ", dy.shape(), " but ", name, " ", shape,
+                " and the weight ", weight.shape(), " give ", expected);
+  };
+  if (dx) check_input("dx", dx.shape());
+  if (dweight) check_input("x", x.shape());
+  LVGGT_CHECK(dweight.empty() || dweight.shape() == weight.shape(),
+              "conv_transpose2d_backward: dweight is ", dweight.shape(), " but the weight is ",
+              weight.shape());
+  LVGGT_CHECK(dbias.empty() || dbias.extent(0) == dy.extent(3),
+              "conv_transpose2d_backward: dbias is ", dbias.shape(), " but dy is ", dy.shape());
+  // The convolution that this layer is the input gradient of reads dy and writes dx; its weight is
+  // this one, [Cout, Cin, k, k] of that convolution.
+  if (dweight) kernels::weight_gradient(dweight, x, dy, k, 0, ctx);
+  if (dbias) kernels::bias_gradient(dbias, dy, ctx);
+  if (dx) conv2d_forward(dx, dy, pack_conv2d(weight, k, 0), {}, ctx);
+}
+
+void linear_backward(View<float, 2> dx, View<float, 2> dweight, View<float, 1> dbias,
+                     View<const float, 2> dy, View<const float, 2> x, View<const float, 2> weight,
+                     Context& ctx) {
+  conv2d_backward(as_map(dx), as_filters(dweight), dbias, as_map(dy), as_map(x), as_filters(weight),
+                  1, 0, ctx);
+}
+
+}  // namespace lvggt
