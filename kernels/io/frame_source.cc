@@ -27,10 +27,14 @@ std::string extension_of(std::string_view name) {
   return extension;
 }
 
+}  // namespace
+
 bool has_image_extension(std::string_view name) {
   const std::string extension = extension_of(name);
   return extension == "png" || extension == "jpg" || extension == "jpeg";
 }
+
+namespace {
 
 // Names of the images in a folder, in natural order, and how many entries are something else.
 struct Listing {

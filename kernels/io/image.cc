@@ -84,6 +84,29 @@ std::uint8_t over_white(std::uint32_t sample, std::uint32_t alpha) {
   return static_cast<std::uint8_t>((((sum >> 8) + sum) >> 8) >> kBits);
 }
 
+// Everything that is checked before pixels are decoded.
+detail::ImageHeader check_file(std::span<const std::byte> bytes, const std::string& name,
+                               const Limits& limits) {
+  if (bytes.empty()) fail(ErrorKind::kFormat, name, ": is empty, expected a PNG or JPEG image");
+  if (bytes.size() > static_cast<std::size_t>(kMaxImageBytes))
+    fail(ErrorKind::kLimit, name, ": has ", bytes.size(), " bytes, more than the limit of ",
+         kMaxImageBytes);
+  const FileGuess guess = guess_file(bytes.first(std::min<std::size_t>(bytes.size(), 64)));
+  if (guess.kind == FileKind::kUnsupportedImage)
+    fail(ErrorKind::kUnsupported, name, ": ", guess.name,
+         " images are not supported, convert it to PNG or JPEG");
+  if (guess.kind != FileKind::kPng && guess.kind != FileKind::kJpeg) {
+    const std::string hint = content_hint(
+        {reinterpret_cast<const char*>(bytes.data()), std::min<std::size_t>(bytes.size(), 1024)});
+    fail(ErrorKind::kFormat, name, ": is not a PNG or JPEG image", hint.empty() ? "" : "; ", hint);
+  }
+
+  detail::ImageHeader header = guess.kind == FileKind::kPng ? detail::check_png(bytes, name)
+                                                            : detail::check_jpeg(bytes, name);
+  check_size(header.width, header.height, bytes.size(), name, limits);
+  return header;
+}
+
 }  // namespace
 
 Image image_from_pixels(View<const std::uint8_t, 3> pixels) {
@@ -106,23 +129,7 @@ Image image_from_pixels(View<const std::uint8_t, 3> pixels) {
 }
 
 Image load_image(std::span<const std::byte> bytes, const std::string& name, const Limits& limits) {
-  if (bytes.empty()) fail(ErrorKind::kFormat, name, ": is empty, expected a PNG or JPEG image");
-  if (bytes.size() > static_cast<std::size_t>(kMaxImageBytes))
-    fail(ErrorKind::kLimit, name, ": has ", bytes.size(), " bytes, more than the limit of ",
-         kMaxImageBytes);
-  const FileGuess guess = guess_file(bytes.first(std::min<std::size_t>(bytes.size(), 64)));
-  if (guess.kind == FileKind::kUnsupportedImage)
-    fail(ErrorKind::kUnsupported, name, ": ", guess.name,
-         " images are not supported, convert it to PNG or JPEG");
-  if (guess.kind != FileKind::kPng && guess.kind != FileKind::kJpeg) {
-    const std::string hint = content_hint(
-        {reinterpret_cast<const char*>(bytes.data()), std::min<std::size_t>(bytes.size(), 1024)});
-    fail(ErrorKind::kFormat, name, ": is not a PNG or JPEG image", hint.empty() ? "" : "; ", hint);
-  }
-
-  detail::ImageHeader header = guess.kind == FileKind::kPng ? detail::check_png(bytes, name)
-                                                            : detail::check_jpeg(bytes, name);
-  check_size(header.width, header.height, bytes.size(), name, limits);
+  detail::ImageHeader header = check_file(bytes, name, limits);
   std::vector<std::byte> completed;
   if (header.short_palette != 0) bytes = completed = with_full_palette(bytes, header.short_palette);
   Shape<3> shape;
@@ -132,6 +139,14 @@ Image load_image(std::span<const std::byte> bytes, const std::string& name, cons
     image.pixels = detail::reoriented(image.pixels, detail::from_exif(header.orientation));
   image.notes = std::move(header.notes);
   return image;
+}
+
+ImageSize check_image(std::span<const std::byte> bytes, const std::string& name,
+                      const Limits& limits) {
+  const detail::ImageHeader header = check_file(bytes, name, limits);
+  const bool transposed = detail::from_exif(header.orientation).transpose;
+  return transposed ? ImageSize{header.height, header.width}
+                    : ImageSize{header.width, header.height};
 }
 
 Image load_image(const std::string& path, const Limits& limits) {

@@ -65,6 +65,9 @@ class FrameSource {
 // "frame10.png".
 bool natural_less(std::string_view a, std::string_view b);
 
+// Whether the name ends in .png, .jpg or .jpeg, in any case.
+bool has_image_extension(std::string_view name);
+
 // The PNG and JPEG files (by extension, in any case) of a folder in natural order, or one image
 // file. Hidden files, folders and other files are skipped and counted. Errors: kUsage (options out
 // of range, start beyond the last frame), kRead, kUnsupported (no image in the folder).

@@ -57,6 +57,15 @@ Image load_image(const std::string& path, const Limits& limits = {});
 Image load_image(std::span<const std::byte> bytes, const std::string& name,
                  const Limits& limits = {});
 
+// Width and height of the picture that load_image() would give, from a walk over the whole file:
+// structure, checksums and limits are checked as there, but no pixel is decoded.
+struct ImageSize {
+  std::int64_t width = 0, height = 0;
+  friend bool operator==(const ImageSize&, const ImageSize&) = default;
+};
+ImageSize check_image(std::span<const std::byte> bytes, const std::string& name,
+                      const Limits& limits = {});
+
 // An Image of pixels already decoded: grey, grey + alpha, RGB or RGBA by the number of channels.
 Image image_from_pixels(View<const std::uint8_t, 3> pixels);  // [H, W, 1 to 4]
 
