@@ -61,6 +61,47 @@ BENCHMARK(conv2d_forward)
     ->UseManualTime()
     ->Unit(benchmark::kMillisecond);
 
+// Input and parameter gradients apart: each does as many multiply-adds as the forward pass.
+void conv2d_backward(benchmark::State& state, bool parameters) {
+  const std::int64_t kernel = state.range(0), Cin = state.range(1), Cout = state.range(2);
+  const std::int64_t H = state.range(3), W = state.range(4);
+  const std::int64_t stride = kernel == 2 ? 2 : 1, padding = kernel == 3 ? 1 : 0;
+  Context ctx;
+  const auto x = random_tensor(Shape{std::int64_t{1}, H, W, Cin}, 1);
+  const auto weight = random_tensor(Shape{Cout, Cin, kernel, kernel}, 2);
+  const auto dy = random_tensor(Shape{std::int64_t{1}, conv2d_extent(H, kernel, stride, padding),
+                                      conv2d_extent(W, kernel, stride, padding), Cout},
+                                3);
+  Tensor<float, 4> dx(x.shape()), dweight(weight.shape());
+  Tensor<float, 1> dbias(Shape{Cout});
+  const double flops = 2.0 * static_cast<double>(dy.size() * Cin * kernel * kernel);
+  run_against_peak(state, ctx, flops, [&] {
+    if (parameters) {
+      lvggt::conv2d_backward({}, dweight, dbias, dy, x, weight, stride, padding, ctx);
+    } else {
+      lvggt::conv2d_backward(dx, {}, {}, dy, {}, weight, stride, padding, ctx);
+    }
+  });
+}
+
+void backward_sizes(benchmark::internal::Benchmark* bench) {
+  bench->ArgNames({"kernel", "Cin", "Cout", "H", "W"})
+      ->Args({3, 256, 256, 168, 296})
+      ->Args({3, 128, 128, 168, 296})
+      ->Args({3, 128, 32, 294, 518})
+      ->Args({3, 64, 32, 294, 518})
+      ->Args({3, 32, 32, 294, 518})
+      ->Args({3, 256, 256, 36, 64})
+      ->Args({3, 32, 3, 294, 518})
+      ->Args({2, 64, 64, 147, 259})
+      ->Args({1, 2048, 256, 21, 37})
+      ->Args({1, 128, 128, 168, 296})
+      ->UseManualTime()
+      ->Unit(benchmark::kMillisecond);
+}
+BENCHMARK_CAPTURE(conv2d_backward, input, false)->Apply(backward_sizes);
+BENCHMARK_CAPTURE(conv2d_backward, parameters, true)->Apply(backward_sizes);
+
 void conv_transpose2d_forward(benchmark::State& state) {
   const std::int64_t kernel = state.range(0), C = state.range(1), H = state.range(2),
                      W = state.range(3);

@@ -136,8 +136,11 @@ void conv2d_backward(View<float, 4> dx, View<float, 4> dweight, View<float, 1> d
               dweight.shape(), " but the weight is ", weight.shape());
   LVGGT_CHECK(dbias.empty() || dbias.extent(0) == dy.extent(3), "conv2d_backward: dbias is ",
               dbias.shape(), " but dy is ", dy.shape());
-  if (dweight) kernels::weight_gradient(dweight, dy, x, stride, padding, ctx);
-  if (dbias) kernels::bias_gradient(dbias, dy, ctx);
+  if (dweight) {
+    kernels::weight_gradient(dweight, dbias, dy, x, stride, padding, ctx);
+  } else if (dbias) {
+    kernels::bias_gradient(dbias, dy, ctx);
+  }
   if (dx.empty()) return;
   Arena::Scope scope(ctx.arena());
   const InputGradient gradient(dx, dy, weight, stride, padding, ctx);
@@ -166,7 +169,7 @@ void conv_transpose2d_backward(View<float, 4> dx, View<float, 4> dweight, View<f
               "conv_transpose2d_backward: dbias is ", dbias.shape(), " but dy is ", dy.shape());
   // The convolution that this layer is the input gradient of reads dy and writes dx; its weight is
   // this one, [Cout, Cin, k, k] of that convolution.
-  if (dweight) kernels::weight_gradient(dweight, x, dy, k, 0, ctx);
+  if (dweight) kernels::weight_gradient(dweight, {}, x, dy, k, 0, ctx);
   if (dbias) kernels::bias_gradient(dbias, dy, ctx);
   if (dx) conv2d_forward(dx, dy, pack_conv2d(weight, k, 0), {}, ctx);
 }

@@ -1,47 +1,343 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "kernels/weight_gradient.h"
 
-#include <vector>
+#undef HWY_TARGET_INCLUDE
+#define HWY_TARGET_INCLUDE "kernels/weight_gradient.cc"
+#include <hwy/foreach_target.h>
+#include <hwy/highway.h>
 
+#include <algorithm>
+
+#include "kernels/grain.h"
+#include "kernels/math-inl.h"
+#include "kernels/tile-inl.h"
+#include "kernels/weight_gradient_plan.h"
 #include "lvggt/core/parallel.h"
 
+#ifndef LVGGT_KERNELS_WEIGHT_GRADIENT_ONCE
+#define LVGGT_KERNELS_WEIGHT_GRADIENT_ONCE
 namespace lvggt::kernels {
 
-void weight_gradient(View<float, 4> dweight, View<const float, 4> dy, View<const float, 4> x,
-                     std::int64_t stride, std::int64_t padding, Context& ctx) {
-  const std::int64_t Cout = dweight.extent(0), Cin = dweight.extent(1), k = dweight.extent(2);
-  const std::int64_t B = dy.extent(0), Ho = dy.extent(1), Wo = dy.extent(2);
-  parallel_chunks(
-      Cout,
-      [&](std::int64_t co, int) {
-        std::vector<float> sums(static_cast<std::size_t>(k * k * Cin));
-        for (std::int64_t n = 0; n < B * Ho * Wo; ++n) {
-          const std::int64_t j = n % Wo, i = n / Wo % Ho, b = n / Wo / Ho;
-          const float g = dy(b, i, j, co);
-          for (std::int64_t t = 0; t < k * k; ++t) {
-            const std::int64_t h = i * stride + t / k - padding, w = j * stride + t % k - padding;
-            if (h < 0 || h >= x.extent(1) || w < 0 || w >= x.extent(2)) continue;
-            const float* row = &x(b, h, w, std::int64_t{0});
-            for (std::int64_t c = 0; c < Cin; ++c)
-              sums[static_cast<std::size_t>(t * Cin + c)] += g * row[c];
-          }
-        }
-        for (std::int64_t t = 0; t < k * k; ++t)
-          for (std::int64_t c = 0; c < Cin; ++c)
-            dweight(co, c, t / k, t % k) += sums[static_cast<std::size_t>(t * Cin + c)];
-      },
-      ctx);
+struct WeightGradientTask {
+  Range groups;      // of input channels
+  Range panels;      // of output channels
+  Range rectangles;  // of dy's pixels
+  float* x;          // scratch, plan.x_floats()
+  float* dy;         // scratch, plan.dy_floats()
+  float* sums;       // result, plan.sum_floats()
+  float* bias_sums;  // result, [16 max_panels], or null
+};
+
+}  // namespace lvggt::kernels
+#endif
+
+HWY_BEFORE_NAMESPACE();
+namespace lvggt::kernels::HWY_NAMESPACE {
+namespace {
+
+// sums[r][n] += sum over rows i and columns j of x[i][j][r] dy[i][j][n], for r < kTileRows and n <
+// 16 kPanels: the tile of every product (see tile-inl.h), with both operands advancing along the
+// summed axis.
+template <int kPanels>
+HWY_NOINLINE void outer_tile(const float* HWY_RESTRICT x, std::int64_t x_row,
+                             const float* HWY_RESTRICT dy, std::int64_t panel_stride,
+                             std::int64_t rows, std::int64_t columns, float* HWY_RESTRICT sums,
+                             std::int64_t sums_stride) {
+  constexpr int kVectors = kPanels * kPanelVectors;
+  const Floats d;
+  hn::Vec<Floats> sum[kTileRows][kVectors];
+#pragma GCC unroll 8
+  for (int r = 0; r < kTileRows; ++r) {
+#pragma GCC unroll 8
+    for (int v = 0; v < kVectors; ++v)
+      sum[r][v] = hn::LoadU(d, sums + r * sums_stride + v * kLanes);
+  }
+  for (std::int64_t i = 0; i < rows; ++i) {
+    const float* HWY_RESTRICT a = x + i * x_row;
+#pragma GCC unroll 1
+    for (std::int64_t j = 0; j < columns; ++j, a += kTileRows, dy += kPanelWidth) {
+      hn::Vec<Floats> b[kVectors];
+#pragma GCC unroll 8
+      for (int v = 0; v < kVectors; ++v) {
+        b[v] = hn::LoadU(d, dy + (v / kPanelVectors) * panel_stride + (v % kPanelVectors) * kLanes);
+      }
+#pragma GCC unroll 8
+      for (int r = 0; r < kTileRows; ++r) {
+        const auto value = hn::Set(d, a[r]);
+#pragma GCC unroll 8
+        for (int v = 0; v < kVectors; ++v) sum[r][v] = hn::MulAdd(value, b[v], sum[r][v]);
+      }
+    }
+  }
+#pragma GCC unroll 8
+  for (int r = 0; r < kTileRows; ++r) {
+#pragma GCC unroll 8
+    for (int v = 0; v < kVectors; ++v)
+      hn::StoreU(sum[r][v], d, sums + r * sums_stride + v * kLanes);
+  }
 }
 
-void bias_gradient(View<float, 1> dbias, View<const float, 4> dy, Context&) {
-  std::vector<double> sums(static_cast<std::size_t>(dy.extent(3)));
-  for (std::int64_t b = 0; b < dy.extent(0); ++b)
-    for (std::int64_t i = 0; i < dy.extent(1); ++i)
-      for (std::int64_t j = 0; j < dy.extent(2); ++j)
-        for (std::int64_t c = 0; c < dy.extent(3); ++c)
-          sums[static_cast<std::size_t>(c)] += dy(b, i, j, c);
-  for (std::int64_t c = 0; c < dy.extent(3); ++c)
-    dbias[c] += static_cast<float>(sums[static_cast<std::size_t>(c)]);
+HWY_INLINE void outer_tile_of(std::int64_t panels, const float* x, std::int64_t x_row,
+                              const float* dy, std::int64_t panel_stride, std::int64_t rows,
+                              std::int64_t columns, float* sums, std::int64_t sums_stride) {
+  if constexpr (kTilePanels >= 3) {
+    if (panels == 3)
+      return outer_tile<3>(x, x_row, dy, panel_stride, rows, columns, sums, sums_stride);
+    if (panels == 2)
+      return outer_tile<2>(x, x_row, dy, panel_stride, rows, columns, sums, sums_stride);
+  }
+  outer_tile<1>(x, x_row, dy, panel_stride, rows, columns, sums, sums_stride);
+}
+
+// Copies the first `count` of `width` values, and zeros for the others.
+HWY_INLINE void copy_padded(float* HWY_RESTRICT to, const float* HWY_RESTRICT from,
+                            std::int64_t count, std::int64_t width) {
+  const Floats d;
+  for (std::int64_t i = 0; i < width; i += kLanes)
+    store_first(load_first(d, from + i, count - i), d, to + i, width - i);
+}
+
+// A rectangle of dy.
+struct Rectangle {
+  std::int64_t b;
+  Range rows, columns;
+};
+
+// [panel][pixel][16], and the sums of the channels.
+void copy_dy(const WeightGradientPlan& plan, View<const float, 4> dy, const Rectangle& rectangle,
+             const WeightGradientTask& task) {
+  const std::int64_t first = task.panels.begin * kPanelWidth;
+  const std::int64_t count = std::min(plan.dy[3], task.panels.end * kPanelWidth) - first;
+  const std::int64_t pixels = rectangle.rows.size() * rectangle.columns.size();
+  float* to = task.dy;
+  for (std::int64_t i = rectangle.rows.begin; i < rectangle.rows.end; ++i) {
+    const float* from = dy.data() + rectangle.b * dy.stride(0) + i * dy.stride(1) +
+                        rectangle.columns.begin * dy.stride(2) + first;
+    for (std::int64_t j = 0; j < rectangle.columns.size(); ++j, from += dy.stride(2)) {
+      for (std::int64_t p = 0; p < task.panels.size(); ++p)
+        copy_padded(to + p * pixels * kPanelWidth, from + p * kPanelWidth, count - p * kPanelWidth,
+                    kPanelWidth);
+      to += kPanelWidth;
+    }
+  }
+  if (task.bias_sums == nullptr) return;
+  const Floats d;
+  for (std::int64_t n = 0; n < task.panels.size() * kPanelWidth; n += kLanes) {
+    const float* HWY_RESTRICT line =
+        task.dy + n / kPanelWidth * pixels * kPanelWidth + n % kPanelWidth;
+    auto even = hn::Zero(d), odd = even;
+    std::int64_t i = 0;
+    for (; i + 2 <= pixels; i += 2) {
+      even = hn::Add(even, hn::LoadU(d, line + i * kPanelWidth));
+      odd = hn::Add(odd, hn::LoadU(d, line + (i + 1) * kPanelWidth));
+    }
+    if (i < pixels) even = hn::Add(even, hn::LoadU(d, line + i * kPanelWidth));
+    hn::StoreU(hn::Add(hn::LoadU(d, task.bias_sums + n), hn::Add(even, odd)), d,
+               task.bias_sums + n);
+  }
+}
+
+// [group][row][column modulo stride][column / stride][kTileRows], zeros beyond the border.
+void copy_x(const WeightGradientPlan& plan, View<const float, 4> x, const Rectangle& rectangle,
+            const WeightGradientTask& task) {
+  const std::int64_t rows = plan.x_rows(rectangle.rows.size());
+  const std::int64_t columns = plan.x_columns(rectangle.columns.size());
+  const std::int64_t used_columns = (rectangle.columns.size() - 1) * plan.stride + plan.kernel;
+  const std::int64_t group_step = rows * plan.stride * columns * kTileRows;
+  const std::int64_t first = task.groups.begin * kTileRows;
+  const std::int64_t count = std::min(plan.x[3], task.groups.end * kTileRows) - first;
+  for (std::int64_t i = 0; i < rows; ++i) {
+    const std::int64_t h = rectangle.rows.begin * plan.stride - plan.padding + i;
+    const float* row = x.data() + rectangle.b * x.stride(0) + h * x.stride(1) + first;
+    for (std::int64_t j = 0; j < used_columns; ++j) {
+      const std::int64_t w = rectangle.columns.begin * plan.stride - plan.padding + j;
+      const bool inside = h >= 0 && h < plan.x[1] && w >= 0 && w < plan.x[2];
+      const float* from = row + (inside ? w * x.stride(2) : 0);
+      float* to =
+          task.x + ((i * plan.stride + j % plan.stride) * columns + j / plan.stride) * kTileRows;
+      for (std::int64_t g = 0; g < task.groups.size(); ++g)
+        copy_padded(to + g * group_step, from + g * kTileRows, inside ? count - g * kTileRows : 0,
+                    kTileRows);
+    }
+  }
+}
+
+void add_rectangle(const WeightGradientPlan& plan, const Rectangle& rectangle,
+                   const WeightGradientTask& task) {
+  const std::int64_t height = rectangle.rows.size(), width = rectangle.columns.size();
+  const std::int64_t columns = plan.x_columns(width);
+  const std::int64_t x_row = plan.stride * columns * kTileRows;
+  const std::int64_t group_step = plan.x_rows(height) * x_row;
+  const std::int64_t panel_step = height * width * kPanelWidth;
+  const std::int64_t sums_stride = task.panels.size() * kPanelWidth;
+  for_panel_groups(task.panels.size(), [&](std::int64_t panel, std::int64_t count) HWY_ATTR {
+    for (std::int64_t g = 0; g < task.groups.size(); ++g) {
+      for (std::int64_t t = 0; t < plan.taps(); ++t) {
+        const std::int64_t ky = t / plan.kernel, kx = t % plan.kernel;
+        const float* x = task.x + g * group_step + ky * x_row +
+                         (kx % plan.stride * columns + kx / plan.stride) * kTileRows;
+        float* sums = task.sums + (t * task.groups.size() + g) * kTileRows * sums_stride +
+                      panel * kPanelWidth;
+        outer_tile_of(count, x, plan.stride * x_row, task.dy + panel * panel_step, panel_step,
+                      height, width, sums, sums_stride);
+      }
+    }
+  });
+}
+
+void run_weight_gradient(const WeightGradientPlan& plan, View<const float, 4> dy,
+                         View<const float, 4> x, const WeightGradientTask& task) {
+  for (std::int64_t n = task.rectangles.begin; n < task.rectangles.end; ++n) {
+    const Rectangle rectangle{n / plan.across / plan.down,
+                              part_of(plan.dy[1], n / plan.across % plan.down, plan.down),
+                              part_of(plan.dy[2], n % plan.across, plan.across)};
+    copy_dy(plan, dy, rectangle, task);
+    copy_x(plan, x, rectangle, task);
+    add_rectangle(plan, rectangle, task);
+  }
+}
+
+std::int64_t tile_rows() { return kTileRows; }
+
+// sums += x, over the pixels of a row.
+void add_pixels(float* HWY_RESTRICT sums, const float* HWY_RESTRICT x, std::int64_t step,
+                std::int64_t W, std::int64_t C) {
+  for_each_vector(C, [=](auto d, std::int64_t c) HWY_ATTR {
+    auto even = hn::LoadU(d, sums + c), odd = hn::Zero(d);
+    std::int64_t w = 0;
+    for (; w + 2 <= W; w += 2) {
+      even = hn::Add(even, hn::LoadU(d, x + w * step + c));
+      odd = hn::Add(odd, hn::LoadU(d, x + (w + 1) * step + c));
+    }
+    if (w < W) even = hn::Add(even, hn::LoadU(d, x + w * step + c));
+    hn::StoreU(hn::Add(even, odd), d, sums + c);
+  });
+}
+
+}  // namespace
+}  // namespace lvggt::kernels::HWY_NAMESPACE
+HWY_AFTER_NAMESPACE();
+
+#if HWY_ONCE
+namespace lvggt::kernels {
+namespace {
+
+HWY_EXPORT(run_weight_gradient);
+HWY_EXPORT(tile_rows);
+HWY_EXPORT(add_pixels);
+
+// The task's place in the plan; tasks of the same pixels follow each other.
+struct TaskIndex {
+  std::int64_t share, input_block, output_block;
+};
+TaskIndex task_index(const WeightGradientPlan& plan, std::int64_t task) {
+  return {task / plan.output_blocks / plan.input_blocks,
+          task / plan.output_blocks % plan.input_blocks, task % plan.output_blocks};
+}
+
+// dweight += the shares' sums, in order, for one panel of output and one group of input channels:
+// what is read and written then fits a first-level cache, although one runs along co and the other
+// along t.
+void add_shares(const WeightGradientPlan& plan, View<float, 4> dweight, View<const float, 2> sums,
+                std::int64_t panel, std::int64_t group) {
+  const std::int64_t i = part_with(plan.input_groups, group, plan.input_blocks);
+  const std::int64_t o = part_with(plan.output_panels, panel, plan.output_blocks);
+  const Range groups = part_of(plan.input_groups, i, plan.input_blocks);
+  const Range panels = part_of(plan.output_panels, o, plan.output_blocks);
+  const std::int64_t width = panels.size() * kPanelWidth;
+  const std::int64_t ci_end = std::min(plan.x[3], (group + 1) * plan.tile_rows);
+  const std::int64_t co_end = std::min(plan.dy[3], (panel + 1) * kPanelWidth);
+  for (std::int64_t co = panel * kPanelWidth; co < co_end; ++co) {
+    for (std::int64_t ci = group * plan.tile_rows; ci < ci_end; ++ci) {
+      for (std::int64_t t = 0; t < plan.taps(); ++t) {
+        const std::int64_t row =
+            t * groups.size() * plan.tile_rows + ci - groups.begin * plan.tile_rows;
+        const std::int64_t at = row * width + co - panels.begin * kPanelWidth;
+        float sum = 0;
+        for (std::int64_t s = 0; s < plan.shares; ++s)
+          sum += sums[(s * plan.input_blocks + i) * plan.output_blocks + o][at];
+        dweight(co, ci, t / plan.kernel, t % plan.kernel) += sum;
+      }
+    }
+  }
+}
+
+// dbias += the shares' sums, in order.
+void add_bias_shares(const WeightGradientPlan& plan, View<float, 1> dbias,
+                     View<const float, 2> sums) {
+  for (std::int64_t s = 0; s < plan.shares; ++s) {
+    for (std::int64_t o = 0; o < plan.output_blocks; ++o) {
+      const Range panels = part_of(plan.output_panels, o, plan.output_blocks);
+      const View<const float, 1> line = sums[s * plan.output_blocks + o];
+      const std::int64_t first = panels.begin * kPanelWidth;
+      for (std::int64_t c = first; c < std::min(plan.dy[3], panels.end * kPanelWidth); ++c)
+        dbias[c] += line[c - first];
+    }
+  }
+}
+
+}  // namespace
+
+void weight_gradient(View<float, 4> dweight, View<float, 1> dbias, View<const float, 4> dy,
+                     View<const float, 4> x, std::int64_t stride, std::int64_t padding,
+                     Context& ctx) {
+  if (dy.size() == 0 || x.extent(3) == 0) return;
+  const WeightGradientPlan plan(dy.shape(), x.shape(), dweight.extent(2), stride, padding,
+                                HWY_DYNAMIC_DISPATCH(tile_rows)());
+  Arena::Scope scope(ctx.arena());
+  const std::int64_t workers = ctx.num_threads();
+  const View<float, 2> x_scratch = ctx.arena().alloc(Shape{workers, plan.x_floats()});
+  const View<float, 2> dy_scratch = ctx.arena().alloc(Shape{workers, plan.dy_floats()});
+  const View<float, 2> sums = ctx.arena().alloc(Shape{plan.tasks(), plan.sum_floats()});
+  const View<float, 2> bias_sums =
+      ctx.arena().alloc(Shape{plan.shares * plan.output_blocks, plan.max_panels() * kPanelWidth});
+  const auto run = HWY_DYNAMIC_DISPATCH(run_weight_gradient);
+  parallel_chunks(
+      plan.tasks(),
+      [&](std::int64_t task, int worker) {
+        const TaskIndex at = task_index(plan, task);
+        float* bias = nullptr;
+        if (dbias && at.input_block == 0) {
+          const View<float, 1> line = bias_sums[at.share * plan.output_blocks + at.output_block];
+          std::fill_n(line.data(), line.size(), 0.0f);
+          bias = line.data();
+        }
+        std::fill_n(sums[task].data(), plan.sum_floats(), 0.0f);
+        run(plan, dy, x,
+            {part_of(plan.input_groups, at.input_block, plan.input_blocks),
+             part_of(plan.output_panels, at.output_block, plan.output_blocks),
+             part_of(plan.rectangles(), at.share, plan.shares), x_scratch[worker].data(),
+             dy_scratch[worker].data(), sums[task].data(), bias});
+      },
+      ctx);
+  parallel_chunks(
+      plan.output_panels * plan.input_groups,
+      [&](std::int64_t n, int) {
+        add_shares(plan, dweight, sums, n / plan.input_groups, n % plan.input_groups);
+      },
+      ctx);
+  if (dbias) add_bias_shares(plan, dbias, bias_sums);
+}
+
+void bias_gradient(View<float, 1> dbias, View<const float, 4> dy, Context& ctx) {
+  const std::int64_t H = dy.extent(1), W = dy.extent(2), C = dy.extent(3);
+  const std::int64_t rows = dy.extent(0) * H;
+  const std::int64_t grain = std::max(rows_per_chunk(W * C), ceil_div(rows, 256));
+  const std::int64_t chunks = ceil_div(rows, grain);
+  Arena::Scope scope(ctx.arena());
+  const View<float, 2> sums = ctx.arena().alloc(Shape{chunks, C});
+  const auto add = HWY_DYNAMIC_DISPATCH(add_pixels);
+  parallel_chunks(
+      chunks,
+      [&](std::int64_t chunk, int) {
+        std::fill_n(sums[chunk].data(), C, 0.0f);
+        for (std::int64_t n = chunk * grain; n < std::min(rows, (chunk + 1) * grain); ++n)
+          add(sums[chunk].data(), dy[n / H][n % H].data(), dy.stride(2), W, C);
+      },
+      ctx);
+  for (std::int64_t chunk = 0; chunk < chunks; ++chunk)
+    for (std::int64_t c = 0; c < C; ++c) dbias[c] += sums(chunk, c);
 }
 
 }  // namespace lvggt::kernels
+#endif
