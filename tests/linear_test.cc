@@ -6,6 +6,7 @@
 #include "tests/reference/activation.h"
 #include "tests/reference/linear.h"
 #include "tests/support/compare.h"
+#include "tests/support/gradient.h"
 #include "tests/support/product.h"
 #include "tests/support/random.h"
 #include "tests/support/strided.h"
@@ -127,4 +128,69 @@ TEST_CASE("linear_forward: shapes that do not fit are refused by name") {
                        Error);
   CHECK_THROWS_WITH_AS(linear_forward(y, x, w, {.residual = wrong}, ctx),
                        doctest::Contains("[3,5]"), Error);
+}
+
+TEST_CASE("linear_backward: agrees with the complex step, strided, parameters accumulate") {
+  Context ctx(2);
+  struct Size {
+    std::int64_t M, K, N;
+  };
+  for (const Size& size : {Size{1, 1, 1}, Size{5, 12, 10}, Size{7, 3, 19}, Size{2, 33, 2}}) {
+    CAPTURE(size.K);
+    const auto x = random_tensor(Shape{size.M, size.K}, 1);
+    const auto w = random_tensor(Shape{size.N, size.K}, 2);
+    const auto dy = random_tensor(Shape{size.M, size.N}, 3);
+    const auto dx_expected = complex_step(x, [&](const Tensor<Complex, 2>& v) {
+      return weighted_sum(dy, reference::linear(v, in_complex(w)));
+    });
+    const auto dw_expected = complex_step(w, [&](const Tensor<Complex, 2>& v) {
+      return weighted_sum(dy, reference::linear(in_complex(x), v));
+    });
+    for_each_target([&] {
+      Strided<2> sx(x.view()), sdy(dy.view()), dx(x.shape());
+      Tensor<float, 2> dw(w.shape());
+      Tensor<float, 1> db(Shape{size.N});
+      dw(0, 0) = db[0] = 3;
+      linear_backward(dx.view(), dw, db, sdy.view(), sx.view(), w, ctx);
+      dw(0, 0) -= 3;
+      db[0] -= 3;
+      // Sums of at most 19 (dx) and 7 products of magnitude below 1; the 3 rounds twice more.
+      CHECK_CLOSE(dx.view(), dx_expected, 19 * 19 * kUnit);
+      CHECK_CLOSE(dw, dw_expected, 7 * 16 * kUnit);
+      for (std::int64_t n = 0; n < size.N; ++n) {
+        double sum = 0;
+        for (std::int64_t m = 0; m < size.M; ++m) sum += dy(m, n);
+        CHECK(std::abs(db[n] - sum) < 7 * 16 * kUnit);
+      }
+      CHECK(dx.gaps_untouched());
+      Strided<2> strided_w(w.view());
+      Tensor<float, 2> alone(x.shape());
+      linear_backward(alone, {}, {}, sdy.view(), {}, strided_w.view(), ctx);
+      CHECK_SAME_BITS(alone, dx.view());
+    });
+  }
+}
+
+TEST_CASE("linear_backward: rows and channels across every block, and wrong shapes") {
+  Context ctx(2);
+  const auto x = random_tensor(Shape{1000, 310}, 1), w = random_tensor(Shape{170, 310}, 2);
+  const auto dy = random_tensor(Shape{1000, 170}, 3);
+  Tensor<float, 2> dx(x.shape()), dw(w.shape()), none(Shape{0, 310}), no_dy(Shape{0, 170});
+  Tensor<float, 1> db(Shape{170});
+  linear_backward(dx, dw, db, dy, x, w, ctx);
+  for (const std::int64_t m : {0, 500, 999})
+    for (const std::int64_t k : {0, 17, 309}) {
+      double sum = 0;
+      for (std::int64_t n = 0; n < 170; ++n) sum += static_cast<double>(dy(m, n)) * w(n, k);
+      CHECK(std::abs(dx(m, k) - sum) < 1e-4);
+    }
+  for (const std::int64_t n : {0, 100, 169})
+    for (const std::int64_t k : {0, 290, 309}) {
+      double sum = 0;
+      for (std::int64_t m = 0; m < 1000; ++m) sum += static_cast<double>(dy(m, n)) * x(m, k);
+      CHECK(std::abs(dw(n, k) - sum) < 5e-4);
+    }
+  linear_backward(none, dw, db, no_dy, none, w, ctx);  // no rows
+  CHECK_THROWS_WITH_AS(linear_backward(dx, {}, {}, x, {}, w, ctx), doctest::Contains("1000,310"),
+                       Error);
 }
