@@ -18,7 +18,7 @@
 // The options of lift_video.
 struct LiftOptions {
   std::string video, out, summary, mode = "crop", camera_cache = "stream", point_colors = "input";
-  std::string weights_storage = "f32", cache_storage = "f32";
+  std::string weights_storage = "stored", cache_storage = "f32";
   std::string sha256;  // of the weights file; empty: any
   lvggt::LoadOptions weights;
   lvggt::FrameSourceOptions frames;
@@ -49,7 +49,8 @@ struct LiftOptions {
     // More past frames than the run has are never reached.
     stream.max_past_frames = std::min(stream.max_past_frames, frames.max_frames);
     weights.points = false;
-    weights.storage = StoragePolicy::of(parse_storage(weights_storage, "--weights-storage"));
+    if (weights_storage != "stored")
+      weights.storage = StoragePolicy::of(parse_storage(weights_storage, "--weights-storage"));
     stream.cache_storage = parse_storage(cache_storage, "--cache-storage");
     outputs.ply = !no_ply;
     outputs.depth = !no_depth;
@@ -166,8 +167,9 @@ inline void add_model(lvggt::cli::Program& program, LiftOptions& o) {
       ->capture_default_str();
   program.app()
       .add_option("--weights-storage", o.weights_storage,
-                  "How weights are kept in memory: f32, bf16, f16 or int8; narrower is less exact")
-      ->check(CLI::IsMember({"f32", "bf16", "f16", "int8"}))
+                  "How weights are kept in memory: stored (as in their file), f32, bf16, f16 or "
+                  "int8 (in the transformer); narrower is less exact")
+      ->check(CLI::IsMember({"stored", "f32", "bf16", "f16", "int8"}))
       ->type_name("TYPE")
       ->capture_default_str();
   program.app()

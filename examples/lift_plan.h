@@ -60,8 +60,9 @@ inline Plan plan_run(const Checkpoint& checkpoint, const LiftOptions& options,
   stream.max_past_frames = past_frames;
   stream.decoder = stream.decoder && checkpoint.has_decoder();
   Plan plan;
-  plan.model = plan_memory(checkpoint.config(), transform.height, transform.width, stream,
-                           checkpoint.storage());
+  plan.model =
+      plan_memory(checkpoint.config(), transform.height, transform.width, stream,
+                  [&](const std::string& weight) { return checkpoint.storage_of(weight); });
   plan.total = plan.model.total + program_bytes(transform, checkpoint.config().sbd_levels,
                                                 checkpoint.config().lang_dim);
   return plan;

@@ -256,6 +256,7 @@ int lift(LiftOptions& options, int argc, char** argv) {
   if (already_complete(options, record)) return 0;
   say(concat(threads.threads, threads.threads == 1 ? " thread (" : " threads (", threads.reason,
              "), about ", cli::bytes_text(plan.total), " of memory"));
+  if (!checkpoint.all_f32()) say(checkpoint.storage_summary());
 
   Context ctx(threads.threads);
   Times times;

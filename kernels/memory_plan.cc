@@ -23,17 +23,21 @@ bool transposed_conv(std::string_view name) {
   return false;
 }
 
-// Floats that one tensor takes once packed; the scales of int8 are one for a whole row, nothing
-// beside it. Batch norms are folded away.
-double packed_size(const TensorSpec& spec, const StoragePolicy& policy) {
+using StorageOf = FunctionRef<Storage(const std::string& weight)>;
+
+// Floats that one tensor takes once packed; int8 has a scale and a sum for each channel beside it.
+// Batch norms are folded away.
+double packed_size(const TensorSpec& spec, StorageOf storage_of) {
   const auto& s = spec.shape;
   if (known_unused_tensor(spec.name)) return 0;
   if (spec.name.ends_with(".running_mean") || spec.name.ends_with(".running_var")) return 0;
   if (!spec.name.ends_with(".weight") || s.size() < 2) return static_cast<double>(spec.volume());
   const std::size_t out_axis = transposed_conv(spec.name) ? 1 : 0;
-  const Storage storage = s.size() == 2 ? policy.linear(spec.name) : policy.conv(spec.name);
-  return static_cast<double>(spec.volume()) / static_cast<double>(s[out_axis]) *
-         padded(s[out_axis]) * static_cast<double>(storage_bytes(storage)) / sizeof(float);
+  const Storage storage = storage_of(spec.name);
+  const double channels = padded(s[out_axis]);
+  return static_cast<double>(spec.volume()) / static_cast<double>(s[out_axis]) * channels *
+             static_cast<double>(storage_bytes(storage)) / sizeof(float) +
+         (storage == Storage::kI8 ? 2 * channels : 0);
 }
 
 double group_size(std::int64_t heads, std::int64_t tokens, std::int64_t head_dim,
@@ -96,6 +100,12 @@ double output_floats(const Frame& f, const ModelConfig& c, const StreamOptions& 
 
 MemoryPlan plan_memory(const ModelConfig& c, std::int64_t H, std::int64_t W,
                        const StreamOptions& options, const StoragePolicy& storage) {
+  return plan_memory(c, H, W, options,
+                     [&](const std::string& weight) { return storage.of_weight(weight); });
+}
+
+MemoryPlan plan_memory(const ModelConfig& c, std::int64_t H, std::int64_t W,
+                       const StreamOptions& options, StorageOf storage_of) {
   LVGGT_CHECK(H > 0 && W > 0 && H <= kMaxSide && W <= kMaxSide, "plan_memory: a frame of ", W,
               " x ", H, " pixels does not lie in [1, ", kMaxSide, "]");
   const std::int64_t patches = (H / c.patch_size) * (W / c.patch_size);
@@ -106,9 +116,9 @@ MemoryPlan plan_memory(const ModelConfig& c, std::int64_t H, std::int64_t W,
   double weights = 0;
   for (const TensorSpec& spec : geometry_tensors(c))
     if (options.points || !spec.name.starts_with("point_head."))
-      weights += packed_size(spec, storage);
+      weights += packed_size(spec, storage_of);
   if (options.decoder)
-    for (const TensorSpec& spec : decoder_tensors(c)) weights += packed_size(spec, storage);
+    for (const TensorSpec& spec : decoder_tensors(c)) weights += packed_size(spec, storage_of);
 
   double cache_per_frame =
       static_cast<double>(c.agg_depth) *

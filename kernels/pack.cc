@@ -2,7 +2,9 @@
 #include "kernels/pack.h"
 
 #include <algorithm>
+#include <bit>
 #include <cmath>
+#include <limits>
 
 namespace lvggt {
 
@@ -23,32 +25,39 @@ PackedMatrix empty_matrix(std::int64_t N, std::int64_t taps, std::int64_t K, Sto
 
 namespace {
 
-PackedMatrix pack_int8(View<const float, 2> weight) {
-  const auto [N, K] = weight.shape();
+// An int8 matrix with its panels still zero.
+PackedMatrix empty_int8(std::int64_t N, std::int64_t K) {
   const std::int64_t quads = (K + 3) / 4;
   const std::int64_t padded = num_panels(N) * kPanelWidth;
-  PackedMatrix packed{N,
-                      1,
-                      K,
-                      Storage::kI8,
-                      Tensor<std::byte, 1>(Shape{padded * quads * 4}),
-                      Tensor<float, 1>(Shape{padded}),
-                      Tensor<std::int32_t, 1>(Shape{padded})};
+  return {N,
+          1,
+          K,
+          Storage::kI8,
+          Tensor<std::byte, 1>(Shape{padded * quads * 4}),
+          Tensor<float, 1>(Shape{padded}),
+          Tensor<std::int32_t, 1>(Shape{padded})};
+}
+
+void set_channel(PackedMatrix& packed, std::int64_t n, const std::int8_t* integers, float scale) {
+  const std::int64_t quads = (packed.K + 3) / 4;
+  auto* lines = reinterpret_cast<std::int8_t*>(packed.panels.data()) +
+                (n / kPanelWidth * quads * kPanelWidth + n % kPanelWidth) * 4;
+  std::int32_t sum = 0;
+  for (std::int64_t k = 0; k < packed.K; ++k) {
+    lines[k / 4 * kPanelWidth * 4 + k % 4] = integers[k];
+    sum += integers[k];
+  }
+  packed.scales(n) = scale;
+  packed.weight_sums(n) = sum;
+}
+
+PackedMatrix pack_int8(View<const float, 2> weight) {
+  const auto [N, K] = weight.shape();
+  PackedMatrix packed = empty_int8(N, K);
+  Tensor<std::int8_t, 1> integers(Shape{K});
   for (std::int64_t n = 0; n < N; ++n) {
-    const float* row = weight.data() + n * weight.stride(0);
-    float largest = 0;
-    for (std::int64_t k = 0; k < K; ++k) largest = std::max(largest, std::abs(row[k]));
-    const float scale = largest / kInt8WeightMax;
-    packed.scales(n) = scale;
-    const float inverse = scale > 0 ? 1 / scale : 0;
-    auto* lines = reinterpret_cast<std::int8_t*>(packed.panels.data()) +
-                  (n / kPanelWidth * quads * kPanelWidth + n % kPanelWidth) * 4;
-    for (std::int64_t k = 0; k < K; ++k) {
-      const auto q = static_cast<std::int8_t>(std::clamp(
-          std::nearbyint(row[k] * inverse), -1.0f * kInt8WeightMax, 1.0f * kInt8WeightMax));
-      lines[k / 4 * kPanelWidth * 4 + k % 4] = q;
-      packed.weight_sums(n) += q;
-    }
+    const float scale = quantize_channel(integers.data(), weight.data() + n * weight.stride(0), K);
+    set_channel(packed, n, integers.data(), scale);
   }
   return packed;
 }
@@ -64,6 +73,37 @@ PackedMatrix pack_linear(View<const float, 2> weight, Storage storage) {
     for (std::int64_t k = 0; k < K; ++k) kernels::set_weight(packed, n, k, row[k]);
   }
   return packed;
+}
+
+PackedMatrix pack_linear(View<const std::int8_t, 2> integers, View<const float, 1> scales) {
+  const auto [N, K] = integers.shape();
+  LVGGT_CHECK(scales.extent(0) == N, "pack_linear: integers are ", integers.shape(),
+              " but scales are ", scales.shape());
+  PackedMatrix packed = empty_int8(N, K);
+  for (std::int64_t n = 0; n < N; ++n)
+    set_channel(packed, n, integers.data() + n * integers.stride(0), scales(n));
+  return packed;
+}
+
+float quantize_channel(std::int8_t* integers, const float* weights, std::int64_t K) {
+  float largest = 0, poison = 0;  // x - x: 0, or NaN for NaN and infinity
+  for (std::int64_t k = 0; k < K; ++k) {
+    largest = std::max(largest, std::abs(weights[k]));
+    poison += weights[k] - weights[k];
+  }
+  const float scale = largest / kInt8WeightMax + poison;
+  if (!(scale >= std::numeric_limits<float>::min())) {
+    std::fill_n(integers, K, std::int8_t{0});
+    return poison;
+  }
+  const float inverse = 1 / scale;
+  // Adding 1.5 * 2^23 rounds to the nearest integer and leaves it in the low bits.
+  constexpr float kRound = 12582912.0f;
+  for (std::int64_t k = 0; k < K; ++k)
+    integers[k] =
+        static_cast<std::int8_t>(std::bit_cast<std::int32_t>(weights[k] * inverse + kRound) -
+                                 std::bit_cast<std::int32_t>(kRound));
+  return scale;
 }
 
 }  // namespace lvggt

@@ -68,12 +68,48 @@ double difference(const Outputs& a, const Outputs& b) {
 TEST_CASE(
     "StoragePolicy: int8 is for the transformer's linear layers, everything else keeps bf16") {
   const StoragePolicy policy = StoragePolicy::of(Storage::kI8);
-  CHECK(policy.linear("aggregator.patch_embed.blocks.0.mlp.fc1") == Storage::kI8);
-  CHECK(policy.linear("aggregator.global_blocks.3.attn.qkv") == Storage::kI8);
-  CHECK(policy.conv("aggregator.patch_embed.patch_embed.proj") == Storage::kBf16);
-  CHECK(policy.linear("camera_head.trunk.0.attn.qkv") == Storage::kBf16);
-  CHECK(policy.conv("depth_head.projects.0") == Storage::kBf16);
+  CHECK(policy.of_weight("aggregator.patch_embed.blocks.0.mlp.fc1.weight") == Storage::kI8);
+  CHECK(policy.of_weight("aggregator.global_blocks.3.attn.qkv") == Storage::kI8);
+  CHECK(policy.of_weight("aggregator.patch_embed.patch_embed.proj.weight") == Storage::kBf16);
+  CHECK(policy.of_weight("camera_head.trunk.0.attn.qkv.weight") == Storage::kBf16);
+  CHECK(policy.of_weight("camera_head.pose_branch.fc1.weight") == Storage::kBf16);
+  CHECK(policy.of_weight("depth_head.projects.0.weight") == Storage::kBf16);
+  CHECK(policy.of_weight("lang_encoder.down1.0.weight") == Storage::kF32);
   CHECK(StoragePolicy::of(Storage::kF32) == StoragePolicy{});
+}
+
+TEST_CASE("layer_kind: every weight of the model has the kind that its name says") {
+  const std::pair<const char*, const char*> kinds[] = {
+      {"aggregator.patch_embed.blocks.23.attn.qkv.weight", "dino.qkv"},
+      {"aggregator.patch_embed.blocks.0.mlp.fc2.weight", "dino.fc2"},
+      {"aggregator.frame_blocks.7.attn.proj.weight", "frame.proj"},
+      {"aggregator.global_blocks.7.mlp.fc1.weight", "global.fc1"},
+      {"camera_head.trunk.3.mlp.fc2.weight", "camera.fc2"},
+      {"camera_head.pose_branch.fc2.weight", "camera.pose"},
+      {"camera_head.poseLN_modulation.1.weight", "camera.pose"},
+      {"aggregator.patch_embed.patch_embed.proj.weight", "patch_embed"},
+      {"depth_head.scratch.layer1_rn.weight", "depth"},
+      {"point_head.projects.0.weight", "points"},
+      {"feature_extractor.resize_layers.0.weight", "decoder.dpt"},
+      {"rgb_decoder.0.final_conv.weight", "decoder.unet"},
+      {"lang_decoder_small.up1.weight", "decoder.unet"}};
+  for (const auto& [name, kind] : kinds) CHECK(kLayerKinds[layer_kind(name)] == kind);
+}
+
+TEST_CASE("StoragePolicy: kinds are chosen by module, by layer or by both; others are refused") {
+  StoragePolicy policy;
+  policy.set("fc2", Storage::kI8, "--kind");
+  CHECK(policy.of_weight("camera_head.trunk.0.mlp.fc2") == Storage::kI8);
+  CHECK(policy.of_weight("camera_head.trunk.0.mlp.fc1") == Storage::kF32);
+  policy.set("dino", Storage::kBf16, "--kind");
+  CHECK(policy.of_weight("aggregator.patch_embed.blocks.0.mlp.fc2") == Storage::kBf16);
+  policy.set("decoder.dpt", Storage::kF16, "--kind");
+  CHECK(policy.of_weight("feature_extractor.projects.0") == Storage::kF16);
+  CHECK(policy.of_weight("lang_encoder.pool1") == Storage::kF32);
+  CHECK_THROWS_WITH_AS(policy.set("depth", Storage::kI8, "--kind"),
+                       doctest::Contains("--kind: depth cannot be int8"), Error);
+  CHECK_THROWS_WITH_AS(policy.set("dino.fc3", Storage::kI8, "--kind"),
+                       doctest::Contains("dino.fc3"), Error);
 }
 
 TEST_CASE(

@@ -10,6 +10,7 @@
 #include "lvggt/io/checked.h"
 #include "lvggt/io/value_summary.h"
 #include "lvggt/model/checkpoint.h"
+#include "lvggt/model/quantized_linear.h"
 #include "lvggt/model/tensor_list.h"
 
 namespace lvggt {
@@ -79,6 +80,13 @@ void count_tensors(const std::vector<TensorEntry>& tensors, WeightsDescription& 
   }
 }
 
+bool is_scale_of_int8(std::string_view name,
+                      const std::map<std::string_view, const TensorEntry*>& tensors) {
+  if (!name.ends_with(".scale")) return false;
+  const auto base = tensors.find(name.substr(0, name.rfind('.')));
+  return base != tensors.end() && base->second->dtype == Dtype::kI8;
+}
+
 void compare_with_config(const std::vector<TensorEntry>& tensors, const Contents& contents,
                          WeightsDescription& d) {
   std::vector<TensorSpec> expected;
@@ -101,8 +109,23 @@ void compare_with_config(const std::vector<TensorEntry>& tensors, const Contents
     }
   }
   for (const TensorEntry& tensor : tensors)
-    if (!names.contains(tensor.name) && !known_unused_tensor(tensor.name))
+    if (!names.contains(tensor.name) && !known_unused_tensor(tensor.name) &&
+        !is_scale_of_int8(tensor.name, found))
       d.extra.push_back(tensor.name);
+}
+
+// Integers that no model can load, and why.
+void check_quantized(const std::string& path, const std::vector<TensorEntry>& tensors,
+                     WeightsDescription& d) {
+  if (d.format != "safetensors" ||
+      std::none_of(tensors.begin(), tensors.end(),
+                   [](const TensorEntry& tensor) { return tensor.dtype == Dtype::kI8; }))
+    return;
+  const Safetensors file = Safetensors::open(path);
+  for (const TensorEntry& entry : file.entries())
+    if (entry.dtype == Dtype::kI8)
+      if (std::string fault = quantized_linear_fault(file, entry); !fault.empty())
+        d.misshapen.push_back(std::move(fault));
 }
 
 void settle_config(const std::string& path, const std::string& text, const Contents& contents,
@@ -113,6 +136,16 @@ void settle_config(const std::string& path, const std::string& text, const Conte
   } else if (d.format == "safetensors" && (contents.geometry || contents.decoder)) {
     const Safetensors file = Safetensors::open(path);
     d.config = infer_config(file, contents.decoder ? &file : nullptr);
+  }
+}
+
+// The values of an int8 weight against its scales.
+void check_integers(const std::string& path, const TensorEntry& tensor, WeightsDescription& d) {
+  const Safetensors file = Safetensors::open(path);
+  try {
+    read_quantized_linear(file, file.at(tensor.name));
+  } catch (const Error& error) {
+    d.suspicious.push_back(error.what());
   }
 }
 
@@ -140,6 +173,7 @@ WeightsDescription describe_weights(const std::string& path) {
   count_tensors(tensors, d);
   settle_config(path, config, contents, d);
   if (d.config) compare_with_config(tensors, contents, d);
+  check_quantized(path, tensors, d);
   return d;
 }
 
@@ -149,6 +183,7 @@ void check_values(const std::string& path, WeightsDescription& description) {
   std::vector<float> values;
   for (std::size_t i = 0; i < source->tensors().size(); ++i) {
     const TensorEntry& tensor = source->tensors()[i];
+    if (tensor.dtype == Dtype::kI8) check_integers(path, tensor, description);
     if (!dtype_is_float(tensor.dtype)) continue;
     stored.resize(static_cast<std::size_t>(tensor.num_bytes));
     values.resize(static_cast<std::size_t>(tensor.size()));

@@ -13,7 +13,7 @@ using namespace lvggt;
 struct Options {
   LoadOptions load;
   std::string case_file;
-  std::string weights_storage = "f32", cache_storage = "f32";
+  std::string weights_storage = "stored", cache_storage = "f32";
   double tolerance = 2e-4;
   int threads = 0;
   bool json = false;
@@ -25,6 +25,15 @@ std::string case_of(const Safetensors& file) {
     fail(ErrorKind::kFormat, file.path(), ": its metadata has no \"case\" that says what it is a ",
          "reference for");
   return found->second;
+}
+
+// Weights that are not all float32 are never silent.
+void say_storage(const LoadOptions& load) {
+  const Checkpoint checkpoint(load);
+  if (!checkpoint.all_f32())
+    std::fprintf(stderr, "check_reference: %s\n", checkpoint.storage_summary().c_str());
+  for (const std::string& warning : checkpoint.warnings())
+    std::fprintf(stderr, "check_reference: warning: %s\n", warning.c_str());
 }
 
 void run_case(const std::string& name, check_reference::Comparison& comparison,
@@ -40,7 +49,9 @@ void run_case(const std::string& name, check_reference::Comparison& comparison,
   if (options.load.weights.empty())
     fail(ErrorKind::kUsage, "--weights is required for the case \"", name, "\"");
   LoadOptions load = options.load;
-  load.storage = StoragePolicy::of(parse_storage(options.weights_storage, "--weights-storage"));
+  if (options.weights_storage != "stored")
+    load.storage = StoragePolicy::of(parse_storage(options.weights_storage, "--weights-storage"));
+  say_storage(load);
   if (streamed) {
     check_reference::check_stream(comparison, load,
                                   parse_storage(options.cache_storage, "--cache-storage"), ctx);
@@ -94,7 +105,8 @@ int main(int argc, char** argv) {
                  "Configuration (JSON); else the weights' metadata or shapes tell it")
       ->type_name("FILE");
   app.add_option("--weights-storage", options.weights_storage,
-                 "How weights are kept: f32, bf16, f16 or int8 (linear layers of the transformer)")
+                 "How weights are kept: stored (as in their file), f32, bf16, f16 or int8 (linear "
+                 "layers of the transformer)")
       ->type_name("TYPE")
       ->capture_default_str();
   app.add_option("--cache-storage", options.cache_storage,

@@ -7,6 +7,7 @@
 #include <set>
 
 #include "lvggt/core/error.h"
+#include "lvggt/model/quantized_linear.h"
 
 namespace lvggt {
 namespace {
@@ -71,6 +72,47 @@ bool is_floating(Dtype dtype) {
          dtype == Dtype::kF64;
 }
 
+// The storage that keeps values of a file's type as they are, as far as there is one.
+Storage storage_of_dtype(Dtype dtype) {
+  switch (dtype) {
+    case Dtype::kBF16:
+      return Storage::kBf16;
+    case Dtype::kF16:
+      return Storage::kF16;
+    case Dtype::kI8:
+      return Storage::kI8;
+    default:
+      return Storage::kF32;
+  }
+}
+
+// The type of a file's values in that storage.
+Dtype dtype_of(Storage storage) {
+  switch (storage) {
+    case Storage::kBf16:
+      return Dtype::kBF16;
+    case Storage::kF16:
+      return Dtype::kF16;
+    case Storage::kI8:
+      return Dtype::kI8;
+    default:
+      return Dtype::kF32;
+  }
+}
+
+// Whether the tensor is packed for products and not kept as float32.
+bool is_weight(const TensorSpec& spec) {
+  return spec.shape.size() >= 2 && spec.name.ends_with(".weight");
+}
+
+// Why the tensor cannot be read as the one of that shape and name, or empty.
+std::string dtype_fault(const Safetensors& file, const TensorEntry& entry, const TensorSpec& spec) {
+  if (is_floating(entry.dtype)) return {};
+  if (entry.dtype == Dtype::kI8 && is_weight(spec)) return quantized_linear_fault(file, entry);
+  return spec.name + " holds " + std::string(dtype_name(entry.dtype)) +
+         " values where floating-point ones are expected";
+}
+
 }  // namespace
 
 struct Checkpoint::Problems {
@@ -102,15 +144,59 @@ Checkpoint::Checkpoint(const LoadOptions& options)
   check_extra(expected, options.strict, problems);
   if (!problems.empty()) report(problems);
 
-  std::vector<std::string> converted;
+  describe_storage(expected);
+}
+
+// Counts the storages of the weights and says which tensors do not stay as the files have them.
+void Checkpoint::describe_storage(const std::vector<TensorSpec>& expected) {
+  std::vector<std::string> widened, rounded_before;
   for (const TensorSpec& spec : expected) {
-    const Found found = look_up(spec.name);
-    if (found.entry && found.entry->dtype != Dtype::kF32)
-      converted.push_back(spec.name + " (" + std::string(dtype_name(found.entry->dtype)) + ")");
+    const Dtype dtype = look_up(spec.name).entry->dtype;
+    const bool weight = is_weight(spec);
+    const Storage storage = weight ? storage_of(spec.name) : Storage::kF32;
+    if (weight) ++storage_counts_[storage];
+    if (dtype == Dtype::kF32 || dtype == dtype_of(storage)) continue;
+    (dtype == Dtype::kI8 ? rounded_before : widened)
+        .push_back(concat(spec.name, " (", dtype_name(dtype), ")"));
   }
-  if (!converted.empty())
-    warnings_.push_back(std::to_string(converted.size()) +
-                        " tensors are widened to float32: " + join(converted, kMostNamed));
+  if (!widened.empty())
+    warnings_.push_back(std::to_string(widened.size()) +
+                        " tensors are widened to float32: " + join(widened, kMostNamed));
+  if (!rounded_before.empty())
+    warnings_.push_back(concat(rounded_before.size(),
+                               " weights are int8 in the file and kept in another type in ",
+                               "memory, which does not bring back what rounding took: ",
+                               join(rounded_before, kMostNamed)));
+}
+
+Storage Checkpoint::storage_of(const std::string& weight) const {
+  if (storage_) return storage_->of_weight(weight);
+  if (layer_kind(weight) == kUnetKind) return Storage::kF32;
+  return storage_of_dtype(find(weight).entry->dtype);
+}
+
+std::string Checkpoint::storage_summary() const {
+  std::string text;
+  for (const auto& [storage, count] : storage_counts_)
+    text += concat(text.empty() ? "" : ", ", count, text.empty() ? " weights as " : " as ",
+                   storage_name(storage));
+  return text;
+}
+
+PackedMatrix Checkpoint::read_linear(const std::string& name) const {
+  const Found found = find(name);
+  const Storage storage = storage_of(name);
+  if (found.entry->dtype != Dtype::kI8 || storage != Storage::kI8)
+    return pack_linear(read<2>(name), storage);
+  const QuantizedLinear quantized = read_quantized_linear(*found.file, *found.entry);
+  return pack_linear(quantized.integers.view(), quantized.scales.view());
+}
+
+Tensor<float, 2> Checkpoint::read_widened_int8(const Found& found) const {
+  const QuantizedLinear quantized = read_quantized_linear(*found.file, *found.entry);
+  Tensor<float, 2> weights(quantized.integers.shape());
+  dequantize(weights, quantized);
+  return weights;
 }
 
 void Checkpoint::refuse_other_models() const {
@@ -182,10 +268,8 @@ void Checkpoint::check_shapes(const std::vector<TensorSpec>& expected, Problems&
           spec.name + " is " + shape_text(found.entry->shape) + " where " + shape_text(spec.shape) +
           " is expected" +
           (looks_transposed(found.entry->shape, spec.shape) ? " (it looks transposed)" : ""));
-    } else if (!is_floating(found.entry->dtype)) {
-      problems.misshapen.push_back(spec.name + " holds " +
-                                   std::string(dtype_name(found.entry->dtype)) +
-                                   " values where floating-point ones are expected");
+    } else if (std::string fault = dtype_fault(*found.file, *found.entry, spec); !fault.empty()) {
+      problems.misshapen.push_back(std::move(fault));
     }
   }
 }
@@ -199,7 +283,8 @@ void Checkpoint::check_extra(const std::vector<TensorSpec>& expected, bool stric
     for (const TensorEntry& entry : file.entries()) {
       const bool used =
           names.contains(entry.name) && decoder_name(entry.name) == takes_decoder_names;
-      if (used || known_unused_tensor(entry.name) || (skip_points_ && point_head_name(entry.name)))
+      if (used || known_unused_tensor(entry.name) || is_scale_of_int8(file, entry.name) ||
+          (skip_points_ && point_head_name(entry.name)))
         continue;
       if (!decoder_ && names.contains(entry.name)) continue;
       extra.push_back(entry.name);

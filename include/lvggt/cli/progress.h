@@ -11,6 +11,7 @@
 #include <cstdio>
 #include <cstdlib>
 #include <string>
+#include <utility>
 
 namespace lvggt::cli {
 
@@ -31,13 +32,14 @@ inline std::string duration_text(double seconds) {
 }
 
 // "57/217 frames, 3.2 frames/s, 0:50 left"; without the total when it is not known (negative).
-inline std::string progress_text(std::int64_t done, std::int64_t total, double seconds) {
+inline std::string progress_text(std::int64_t done, std::int64_t total, double seconds,
+                                 const std::string& unit = "frames") {
   std::string text = std::to_string(done);
   if (total >= 0) text += "/" + std::to_string(total);
-  text += " frames";
+  text += " " + unit;
   if (done == 0 || !(seconds > 0)) return text;
   const double rate = static_cast<double>(done) / seconds;
-  text += ", " + fixed(rate, rate < 9.95 ? 2 : 0) + " frames/s";
+  text += ", " + fixed(rate, rate < 9.95 ? 2 : 0) + " " + unit + "/s";
   if (total > done)
     text += ", " + duration_text(static_cast<double>(total - done) / rate) + " left";
   return text;
@@ -56,7 +58,8 @@ inline std::string progress_bar(std::int64_t done, std::int64_t total, int width
 // otherwise (also on a terminal that cannot redraw: TERM unset or "dumb").
 class Progress {
  public:
-  explicit Progress(std::int64_t total) : total_(total) {
+  explicit Progress(std::int64_t total, std::string unit = "frames")
+      : total_(total), unit_(std::move(unit)) {
     const char* terminal = std::getenv("TERM");
     redraw_ = isatty(STDERR_FILENO) == 1 && terminal != nullptr && std::string(terminal) != "dumb";
     const char* no_color = std::getenv("NO_COLOR");
@@ -72,7 +75,7 @@ class Progress {
     if (shown_ && done != total_ && seconds(now - last_) < interval) return;
     shown_ = true;
     last_ = now;
-    const std::string text = progress_text(done, total_, seconds(now - start_));
+    const std::string text = progress_text(done, total_, seconds(now - start_), unit_);
     if (!redraw_) {
       std::fprintf(stderr, "%s\n", text.c_str());
       return;
@@ -95,6 +98,7 @@ class Progress {
   static double seconds(Clock::duration d) { return std::chrono::duration<double>(d).count(); }
 
   std::int64_t total_;
+  std::string unit_;
   Clock::time_point start_ = Clock::now(), last_;
   bool redraw_ = false, color_ = false, shown_ = false, drawn_ = false;
 };

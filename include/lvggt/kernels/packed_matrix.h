@@ -45,4 +45,13 @@ inline constexpr int kInt8WeightMax = 63;
 // largest magnitude / kInt8WeightMax.
 PackedMatrix pack_linear(View<const float, 2> weight, Storage storage = Storage::kF32);
 
+// The same from integers in [-kInt8WeightMax, kInt8WeightMax] and the scales of their channels,
+// which are packed as they are.   integers: [N, K]   scales: [N]
+PackedMatrix pack_linear(View<const std::int8_t, 2> integers, View<const float, 1> scales);
+
+// The integers of one output channel and their scale, largest magnitude / kInt8WeightMax: what
+// pack_linear makes of a row. A channel whose scale would be subnormal (all zeros, in practice)
+// becomes zeros with scale 0, one that is not finite zeros with scale NaN.
+float quantize_channel(std::int8_t* integers, const float* weights, std::int64_t K);
+
 }  // namespace lvggt

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <map>
 #include <mutex>
 #include <optional>
 #include <span>
@@ -9,6 +10,7 @@
 #include <vector>
 
 #include "lvggt/io/safetensors.h"
+#include "lvggt/kernels/packed_matrix.h"
 #include "lvggt/model/config.h"
 #include "lvggt/model/storage_policy.h"
 #include "lvggt/model/tensor_list.h"
@@ -28,7 +30,8 @@ struct LoadOptions {
   bool strict = false;  // tensors that the configuration does not name are an error, not a warning
   bool allow_nonfinite = false;  // accept NaN and infinity in weights
   bool points = true;            // load the point head, if it is there
-  StoragePolicy storage = {};    // how the packed weights are kept in memory
+  // How the packed weights are kept in memory; not given: as the file keeps each of them.
+  std::optional<StoragePolicy> storage = {};
 };
 
 // What the names and shapes of the tensors tell of the configuration, and `base` for the rest. In
@@ -52,7 +55,15 @@ class Checkpoint {
   explicit Checkpoint(const LoadOptions& options);
 
   const ModelConfig& config() const { return config_; }
-  const StoragePolicy& storage() const { return storage_; }
+
+  // How the weight of that name is kept in memory: as the policy says, else as the file has it,
+  // except for the decoder's UNets, which are float32 then: folding in their batch norms would
+  // undo a file's rounding.
+  Storage storage_of(const std::string& weight) const;
+  // "16 weights as int8, 40 as f32": what the storages of all weights come to.
+  std::string storage_summary() const;
+  bool all_f32() const { return storage_counts_.size() == storage_counts_.count(Storage::kF32); }
+
   bool has_decoder() const { return has_decoder_; }
   bool has_point_head() const { return has_point_head_; }
 
@@ -61,10 +72,17 @@ class Checkpoint {
   template <int R>
   Tensor<float, R> read(const std::string& name) const {
     const Found found = find(name);
+    if constexpr (R == 2) {
+      if (found.entry->dtype == Dtype::kI8) return read_widened_int8(found);
+    }
     Tensor<float, R> values = found.file->read<R>(found.entry->name);
     inspect(name, *found.file, {values.data(), static_cast<std::size_t>(values.size())});
     return values;
   }
+
+  // The weight of a linear layer, packed in its storage. Integers of the file stay exactly as they
+  // are when that is int8. Throws as read() does, and as read_quantized_linear().
+  PackedMatrix read_linear(const std::string& name) const;
 
   // The same, seen as another shape of as many values: a token of [1, 2, 1, C] as [2, C].
   template <int R>
@@ -91,6 +109,8 @@ class Checkpoint {
   void settle_config(const LoadOptions& options);
   void refuse_other_models() const;
   std::vector<TensorSpec> expected_tensors() const;
+  void describe_storage(const std::vector<TensorSpec>& expected);
+  Tensor<float, 2> read_widened_int8(const Found& found) const;
   void check_shapes(const std::vector<TensorSpec>& expected, Problems& problems) const;
   void check_extra(const std::vector<TensorSpec>& expected, bool strict, Problems& problems);
   void report(const Problems& problems) const;
@@ -101,7 +121,8 @@ class Checkpoint {
   std::optional<Safetensors> decoder_;
   std::optional<Safetensors> overrides_;
   ModelConfig config_;
-  StoragePolicy storage_;
+  std::optional<StoragePolicy> storage_;
+  std::map<Storage, std::size_t> storage_counts_;  // weights of all layers
   bool has_decoder_ = false;
   bool has_point_head_ = false;
   bool skip_points_ = false;

@@ -2,7 +2,9 @@
 #pragma once
 
 #include <cstddef>
+#include <string>
 
+#include "lvggt/core/parallel.h"
 #include "lvggt/model/config.h"
 #include "lvggt/model/storage_policy.h"
 #include "lvggt/model/stream_options.h"
@@ -17,8 +19,12 @@ struct MemoryPlan {
   std::size_t total = 0;
 };
 
-// What is needed without loading anything; within about a tenth of the measured memory.
+// What is needed without loading anything; within about a tenth of the measured memory. Weights are
+// kept as the policy says, or as storage_of, given their names in the checkpoint.
 MemoryPlan plan_memory(const ModelConfig& config, std::int64_t H, std::int64_t W,
                        const StreamOptions& options = {}, const StoragePolicy& storage = {});
+MemoryPlan plan_memory(const ModelConfig& config, std::int64_t H, std::int64_t W,
+                       const StreamOptions& options,
+                       FunctionRef<Storage(const std::string& weight)> storage_of);
 
 }  // namespace lvggt

@@ -18,13 +18,20 @@ namespace lvggt {
 // without a final dot.
 
 // A plain file is kept as float32.
-inline const StoragePolicy& storage_policy(const Checkpoint& c) { return c.storage(); }
-inline StoragePolicy storage_policy(const Safetensors&) { return {}; }
+inline Storage storage_of(const Checkpoint& c, const std::string& weight) {
+  return c.storage_of(weight);
+}
+inline Storage storage_of(const Safetensors&, const std::string&) { return Storage::kF32; }
+inline PackedMatrix read_linear(const Checkpoint& c, const std::string& weight) {
+  return c.read_linear(weight);
+}
+inline PackedMatrix read_linear(const Safetensors& file, const std::string& weight) {
+  return pack_linear(file.read<2>(weight));
+}
 
 template <class Source>
 Linear load_linear(const Source& c, const std::string& prefix) {
-  return {pack_linear(c.template read<2>(prefix + ".weight"), storage_policy(c).linear(prefix)),
-          c.template read<1>(prefix + ".bias")};
+  return {read_linear(c, prefix + ".weight"), c.template read<1>(prefix + ".bias")};
 }
 
 template <class Source>
@@ -37,15 +44,15 @@ template <class Source>
 Conv2d load_conv2d(const Source& c, const std::string& prefix, std::int64_t stride,
                    std::int64_t padding) {
   return {pack_conv2d(c.template read<4>(prefix + ".weight"), stride, padding,
-                      storage_policy(c).conv(prefix)),
+                      storage_of(c, prefix + ".weight")),
           c.template read<1>(prefix + ".bias")};
 }
 
 template <class Source>
 ConvTranspose2d load_conv_transpose2d(const Source& c, const std::string& prefix) {
-  return {
-      pack_conv_transpose2d(c.template read<4>(prefix + ".weight"), storage_policy(c).conv(prefix)),
-      c.template read<1>(prefix + ".bias")};
+  return {pack_conv_transpose2d(c.template read<4>(prefix + ".weight"),
+                                storage_of(c, prefix + ".weight")),
+          c.template read<1>(prefix + ".bias")};
 }
 
 // A 1x1 convolution as a linear layer over pixels.
@@ -53,7 +60,7 @@ template <class Source>
 Linear load_pixel_linear(const Source& c, const std::string& prefix) {
   const Tensor<float, 4> weight = c.template read<4>(prefix + ".weight");
   const Shape<2> shape{weight.extent(0), weight.extent(1)};
-  return {pack_linear(weight.view().reshaped(shape), storage_policy(c).conv(prefix)),
+  return {pack_linear(weight.view().reshaped(shape), storage_of(c, prefix + ".weight")),
           c.template read<1>(prefix + ".bias")};
 }
 
@@ -65,7 +72,7 @@ inline Conv2d load_normed_conv2d(const Checkpoint& c, const std::string& conv,
   batch_norm2d_fold(weight, bias, c.read<1>(norm + ".weight"), c.read<1>(norm + ".bias"),
                     c.read<1>(norm + ".running_mean"), c.read<1>(norm + ".running_var"),
                     static_cast<float>(eps));
-  return {pack_conv2d(weight, 1, 1, storage_policy(c).conv(conv)), std::move(bias)};
+  return {pack_conv2d(weight, 1, 1, c.storage_of(conv + ".weight")), std::move(bias)};
 }
 
 inline DoubleConv load_double_conv(const Checkpoint& c, const std::string& prefix, double eps) {
@@ -190,9 +197,8 @@ inline DptHead load_dpt_head(const Checkpoint& c, const std::string& prefix, boo
   for (std::size_t i = 0; i < 4; ++i) {
     const std::string number = std::to_string(i + 1);
     reassemble.projects[i] = load_pixel_linear(c, prefix + ".projects." + std::to_string(i));
-    reassemble.layer_rn[i].weight =
-        pack_conv2d(c.read<4>(scratch + ".layer" + number + "_rn.weight"), 1, 1,
-                    storage_policy(c).conv(scratch));
+    const std::string layer_rn = scratch + ".layer" + number + "_rn.weight";
+    reassemble.layer_rn[i].weight = pack_conv2d(c.read<4>(layer_rn), 1, 1, c.storage_of(layer_rn));
     head.refinenet[i] = load_fusion_block(c, scratch + ".refinenet" + number, i < 3);
   }
   head.output_conv1 = load_conv2d(c, scratch + ".output_conv1", 1, 1);
