@@ -65,4 +65,3 @@ BENCHMARK_CAPTURE(scaled_dot_product_attention, int8, Storage::kI8)->Apply(frame
 
 }  // namespace
 
-BENCHMARK_MAIN();

@@ -76,4 +76,3 @@ BENCHMARK_CAPTURE(block_forward, int8, Storage::kI8)->Apply(tokens);
 
 }  // namespace
 
-BENCHMARK_MAIN();

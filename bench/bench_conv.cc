@@ -141,4 +141,3 @@ BENCHMARK(bilinear_forward)
 
 }  // namespace
 
-BENCHMARK_MAIN();

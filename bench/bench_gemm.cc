@@ -72,4 +72,3 @@ BENCHMARK_CAPTURE(linear_forward, int8, Storage::kI8)
 
 }  // namespace
 
-BENCHMARK_MAIN();

@@ -13,6 +13,7 @@
 #include "hwy/foreach_target.h"
 //
 #include "hwy/highway.h"
+#include "kernels/prefetch-inl.h"
 #include "kernels/simd-inl.h"
 #include "kernels/storage-inl.h"
 #include "kernels/tile-inl.h"
@@ -117,59 +118,99 @@ struct KeyBlock {
   std::int64_t value_stride;  // floats between two panels of values
 };
 
-// Tokens of panels [panel0, panel1) of one head of one group, widened if they are stored narrow.
-KeyBlock key_block(const PackedKeysValues& group, std::int64_t head, std::int64_t panel0,
-                   std::int64_t panel1, const AttentionScratch& s) {
+// Panels [panel0, panel1) of one head of one group; no group: nothing comes next.
+struct KeyRange {
+  const PackedKeysValues* group = nullptr;
+  std::int64_t head = 0;
+  std::int64_t panel0 = 0, panel1 = 0;
+
+  std::int64_t num_keys() const { return (panel1 - panel0) * kPanelWidth; }
+};
+
+// Where a range's keys and values are stored.
+struct StoredRange {
+  const std::byte* keys;          // [panels, D, 16]
+  const std::byte* values;        // [num_panels(D), num_keys, 16], panels value_stride apart
+  const float* key_scales;        // [num_keys], int8 only
+  const float* value_scales;      // [num_keys], int8 only
+  std::int64_t element;           // bytes
+  std::int64_t value_stride = 0;  // bytes
+};
+
+StoredRange stored_range(const KeyRange& range) {
+  const PackedKeysValues& group = *range.group;
   const KeysValuesLayout layout =
       keys_values_layout(group.storage, group.num_heads, group.num_tokens, group.head_dim);
   const std::int64_t D = group.head_dim, panels = num_panels(group.num_tokens);
-  const std::int64_t padded_tokens = panels * kPanelWidth, feature_panels = num_panels(D);
+  const std::int64_t padded_tokens = panels * kPanelWidth;
   const auto bytes = static_cast<std::int64_t>(storage_bytes(group.storage));
-  const std::byte* keys = group.data + (head * panels + panel0) * D * kPanelWidth * bytes;
-  const std::byte* values =
-      group.data + layout.values +
-      (head * feature_panels * padded_tokens + panel0 * kPanelWidth) * kPanelWidth * bytes;
-  if (group.storage == Storage::kF32) {
-    return {reinterpret_cast<const float*>(keys), reinterpret_cast<const float*>(values),
-            padded_tokens * kPanelWidth};
+  const std::int64_t scale0 = range.head * padded_tokens + range.panel0 * kPanelWidth;
+  return {group.data + (range.head * panels + range.panel0) * D * kPanelWidth * bytes,
+          group.data + layout.values +
+              (range.head * num_panels(D) * padded_tokens + range.panel0 * kPanelWidth) *
+                  kPanelWidth * bytes,
+          reinterpret_cast<const float*>(group.data + layout.key_scales) + scale0,
+          reinterpret_cast<const float*>(group.data + layout.value_scales) + scale0,
+          bytes,
+          padded_tokens * kPanelWidth * bytes};
+}
+
+// Keys and values of a range as floats, widened if they are stored narrow.
+KeyBlock key_block(const KeyRange& range, const AttentionScratch& s) {
+  const StoredRange stored = stored_range(range);
+  const Storage storage = range.group->storage;
+  if (storage == Storage::kF32) {
+    return {reinterpret_cast<const float*>(stored.keys),
+            reinterpret_cast<const float*>(stored.values), stored.value_stride / 4};
   }
-  const std::int64_t num_keys = (panel1 - panel0) * kPanelWidth;
-  const std::int64_t scale0 = head * padded_tokens + panel0 * kPanelWidth;
-  const float* key_scales = reinterpret_cast<const float*>(group.data + layout.key_scales) + scale0;
-  const float* value_scales =
-      reinterpret_cast<const float*>(group.data + layout.value_scales) + scale0;
-  if (group.storage == Storage::kI8) {
-    for (std::int64_t p = 0; p < panel1 - panel0; ++p) {
-      widen_lines_by_lane(reinterpret_cast<const std::int8_t*>(keys) + p * D * kPanelWidth, D,
-                          key_scales + p * kPanelWidth, s.keys + p * D * kPanelWidth);
+  const std::int64_t D = range.group->head_dim, num_keys = range.num_keys();
+  if (storage == Storage::kI8) {
+    for (std::int64_t p = 0; p < range.panel1 - range.panel0; ++p) {
+      widen_lines_by_lane(reinterpret_cast<const std::int8_t*>(stored.keys) + p * D * kPanelWidth,
+                          D, stored.key_scales + p * kPanelWidth, s.keys + p * D * kPanelWidth);
     }
   } else {
-    widen_lines(group.storage, keys, (panel1 - panel0) * D, s.keys);
+    widen_lines(storage, stored.keys, (range.panel1 - range.panel0) * D, s.keys);
   }
-  for (std::int64_t f = 0; f < feature_panels; ++f) {
-    const std::byte* panel = values + f * padded_tokens * kPanelWidth * bytes;
+  for (std::int64_t f = 0; f < num_panels(D); ++f) {
+    const std::byte* panel = stored.values + f * stored.value_stride;
     float* to = s.values + f * num_keys * kPanelWidth;
-    if (group.storage == Storage::kI8) {
-      widen_lines_by_line(reinterpret_cast<const std::int8_t*>(panel), num_keys, value_scales, to);
+    if (storage == Storage::kI8) {
+      widen_lines_by_line(reinterpret_cast<const std::int8_t*>(panel), num_keys,
+                          stored.value_scales, to);
     } else {
-      widen_lines(group.storage, panel, num_keys, to);
+      widen_lines(storage, panel, num_keys, to);
     }
   }
   return {s.keys, s.values, num_keys * kPanelWidth};
 }
 
-// Keys [panel0, panel1) of one head of one group against all queries of the block.
-void attend_block(const PackedKeysValues& group, std::int64_t head, std::int64_t panel0,
-                  std::int64_t panel1, std::int64_t num_queries, const AttentionScratch& s) {
-  const std::int64_t D = group.head_dim;
+// Keys of one range against all queries of the block, while those of the next one are fetched.
+void attend_block(const KeyRange& range, const KeyRange& next, std::int64_t num_queries,
+                  const AttentionScratch& s) {
+  const std::int64_t D = range.group->head_dim;
   const std::int64_t feature_panels = num_panels(D);
   const std::int64_t width = feature_panels * kPanelWidth;
-  const std::int64_t num_keys = (panel1 - panel0) * kPanelWidth;
-  const std::int64_t valid_keys = std::min(num_keys, group.num_tokens - panel0 * kPanelWidth);
-  const KeyBlock block = key_block(group, head, panel0, panel1, s);
+  const std::int64_t num_keys = range.num_keys();
+  const std::int64_t valid_keys =
+      std::min(num_keys, range.group->num_tokens - range.panel0 * kPanelWidth);
+  const std::int64_t key_panels = range.panel1 - range.panel0;
+  const KeyBlock block = key_block(range, s);
 
-  for_panel_groups(panel1 - panel0, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
+  const std::int64_t tiles = (num_queries + kTileRows - 1) / kTileRows;
+  Prefetch next_keys, next_values;
+  if (next.group != nullptr) {
+    const StoredRange stored = stored_range(next);
+    const std::int64_t bytes = next.num_keys() * kPanelWidth * stored.element;
+    next_keys = {stored.keys, next.num_keys() * D * stored.element, 1, 0,
+                 tiles * num_panel_groups(key_panels)};
+    next_values = {stored.values, bytes, feature_panels, stored.value_stride,
+                   tiles * num_panel_groups(feature_panels)};
+  }
+  std::int64_t part = 0;
+  for_panel_groups(key_panels, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
     for (std::int64_t r = 0; r < num_queries; r += kTileRows) {
+      next_keys.fetch_part(part++);
       tile_of<false>(count, s.query_rows + r, 0, 1, D, block.keys + first * D * kPanelWidth,
                      D * kPanelWidth, s.scores + r * kScorePitch + first * kPanelWidth,
                      kScorePitch);
@@ -180,14 +221,43 @@ void attend_block(const PackedKeysValues& group, std::int64_t head, std::int64_t
     std::fill(scores + valid_keys, scores + num_keys, -std::numeric_limits<float>::infinity());
     softmax_row(scores, num_keys, s.maximum[r], s.sum[r], s.outputs + r * width, width);
   }
+  part = 0;
   for_panel_groups(feature_panels, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
     for (std::int64_t r = 0; r < num_queries; r += kTileRows) {
+      next_values.fetch_part(part++);
       tile_of<true>(count, s.score_rows + r, 0, 1, num_keys,
                     block.values + first * block.value_stride, block.value_stride,
                     s.outputs + r * width + first * kPanelWidth, width);
     }
   });
 }
+
+// The ranges of at most kKeyPanels panels that one head's keys are cut into, group by group.
+class KeyRanges {
+ public:
+  KeyRanges(std::span<const PackedKeysValues> past, std::int64_t head) : past_(past), head_(head) {}
+
+  // The next range; one without a group when there is none.
+  KeyRange next() {
+    while (!past_.empty()) {
+      const PackedKeysValues& group = past_.front();
+      const std::int64_t panels = num_panels(group.num_tokens);
+      const std::int64_t blocks = (panels + kKeyPanels - 1) / kKeyPanels;
+      if (block_ < blocks) {
+        const std::int64_t b = block_++;
+        return {&group, head_, panels * b / blocks, panels * (b + 1) / blocks};
+      }
+      past_ = past_.subspan(1);
+      block_ = 0;
+    }
+    return {};
+  }
+
+ private:
+  std::span<const PackedKeysValues> past_;
+  std::int64_t head_;
+  std::int64_t block_ = 0;
+};
 
 // Queries [q0, q1) of one head over all groups.
 void attend(View<float, 3> y, View<const float, 3> q, std::span<const PackedKeysValues> past,
@@ -212,12 +282,11 @@ void attend(View<float, 3> y, View<const float, 3> q, std::span<const PackedKeys
   std::fill_n(s.maximum, kQueryBlock, -std::numeric_limits<float>::infinity());
   std::fill_n(s.sum, kQueryBlock, 0.0f);
 
-  for (const PackedKeysValues& group : past) {
-    const std::int64_t panels = num_panels(group.num_tokens);
-    const std::int64_t blocks = (panels + kKeyPanels - 1) / kKeyPanels;
-    for (std::int64_t b = 0; b < blocks; ++b) {
-      attend_block(group, head, panels * b / blocks, panels * (b + 1) / blocks, count, s);
-    }
+  KeyRanges ranges(past, head);
+  for (KeyRange range = ranges.next(); range.group != nullptr;) {
+    const KeyRange next = ranges.next();
+    attend_block(range, next, count, s);
+    range = next;
   }
 
   for (std::int64_t r = 0; r < count; ++r) {

@@ -9,6 +9,7 @@
 //
 #include "hwy/highway.h"
 #include "kernels/epilogue-inl.h"
+#include "kernels/prefetch-inl.h"
 #include "kernels/simd-inl.h"
 #include "kernels/storage-inl.h"
 #include "kernels/tile-inl.h"
@@ -69,26 +70,60 @@ Panels block_panels(const Product& p, std::int64_t panel, std::int64_t count, st
   return {scratch.widened, kBlockK * kPanelWidth};
 }
 
-// One K block: `taps` taps of K values each, for all rows and panels of the chunk. The rows' table
-// has row_stride addresses a tap; `lines` is where the block starts inside a panel.
+// Lines [line, line + num_lines) of `count` panels from `panel` on, as they are stored.
+Prefetch prefetch_panels(const Product& p, std::int64_t panel, std::int64_t count,
+                         std::int64_t line, std::int64_t num_lines, std::int64_t parts) {
+  const std::int64_t line_bytes =
+      kPanelWidth * static_cast<std::int64_t>(storage_bytes(p.w->storage));
+  const std::int64_t panel_lines = p.taps * p.K;
+  return {p.w->panels.data() + (panel * panel_lines + line) * line_bytes, num_lines * line_bytes,
+          count, panel_lines * line_bytes, parts};
+}
+
+// A K block: `taps` taps of K values each, for all rows and panels of a chunk.
+struct Block {
+  const float* const* rows;  // [taps, row_stride], addresses
+  std::int64_t row_stride;
+  std::int64_t taps;
+  std::int64_t K;
+  std::int64_t line;  // where the block starts inside a panel
+  bool is_first;
+  bool is_last;
+};
+
 void run_block(const Product& p, const RowTable& table, std::int64_t panel0, std::int64_t panel1,
-               const float* const* rows, std::int64_t row_stride, std::int64_t taps, std::int64_t K,
-               std::int64_t lines, bool is_first, bool is_last, const ChunkScratch& scratch) {
+               const Block& block, const ChunkScratch& scratch) {
+  const std::int64_t lines = block.taps * block.K;
+  const std::int64_t tiles = (table.count + kTileRows - 1) / kTileRows;
   for_panel_groups(panel1 - panel0, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
-    const Panels panels = block_panels(p, panel0 + first, count, lines, taps * K, scratch);
+    const std::int64_t panel = panel0 + first;
+    const Panels panels = block_panels(p, panel, count, block.line, lines, scratch);
+    Prefetch next;
+    if (panel + count < panel1) {
+      next = prefetch_panels(p, panel + count, std::min(count, panel1 - panel - count), block.line,
+                             lines, tiles);
+    } else if (!block.is_last) {
+      const std::int64_t line = block.line + lines;
+      next = prefetch_panels(p, panel0, std::min<std::int64_t>(kTilePanels, panel1 - panel0), line,
+                             std::min(lines, p.taps * p.K - line), tiles);
+    }
     float* sums = scratch.sums + first * kPanelWidth;
-    const std::int64_t n0 = (panel0 + first) * kPanelWidth;
+    const std::int64_t n0 = panel * kPanelWidth;
     const std::int64_t n1 = std::min(p.w->N, n0 + count * kPanelWidth);
-    for (std::int64_t r = 0; r < table.count; r += kTileRows) {
+    for (std::int64_t tile = 0; tile < tiles; ++tile) {
+      next.fetch_part(tile);
+      const std::int64_t r = tile * kTileRows;
       float* out = sums + r * kSumPitch;
-      if (is_first) {
-        tile_of<false>(count, rows + r, row_stride, taps, K, panels.lines, panels.stride, out,
-                       kSumPitch);
+      if (block.is_first) {
+        tile_of<false>(count, block.rows + r, block.row_stride, block.taps, block.K, panels.lines,
+                       panels.stride, out, kSumPitch);
       } else {
-        tile_of<true>(count, rows + r, row_stride, taps, K, panels.lines, panels.stride, out,
-                      kSumPitch);
+        tile_of<true>(count, block.rows + r, block.row_stride, block.taps, block.K, panels.lines,
+                      panels.stride, out, kSumPitch);
       }
-      if (is_last) finish_any(p, table, sums, r, std::min(table.count, r + kTileRows), n0, n1);
+      if (block.is_last) {
+        finish_any(p, table, sums, r, std::min(table.count, r + kTileRows), n0, n1);
+      }
     }
   });
 }
@@ -105,18 +140,24 @@ void run_chunk(const Product& p, const RowTable& table, std::int64_t panel0, std
         const std::int64_t k0 = K * b / blocks;
         const std::int64_t k1 = K * (b + 1) / blocks;
         copy_inputs(table, t, k0, k1, scratch);
-        run_block(p, table, panel0, panel1, scratch.input_rows, 0, 1, k1 - k0, t * K + k0,
-                  t == 0 && b == 0, t == taps - 1 && b == blocks - 1, scratch);
+        run_block(p, table, panel0, panel1,
+                  {scratch.input_rows, 0, 1, k1 - k0, t * K + k0, t == 0 && b == 0,
+                   t == taps - 1 && b == blocks - 1},
+                  scratch);
       }
     }
   } else {  // several taps in one block, read where they are
     const std::int64_t group = std::max<std::int64_t>(1, kBlockK / std::max<std::int64_t>(K, 1));
     for (std::int64_t t = 0; t < taps; t += group) {
-      run_block(p, table, panel0, panel1, table.x + t * table.capacity, table.capacity,
-                std::min(group, taps - t), K, t * K, t == 0, t + group >= taps, scratch);
+      run_block(p, table, panel0, panel1,
+                {table.x + t * table.capacity, table.capacity, std::min(group, taps - t), K, t * K,
+                 t == 0, t + group >= taps},
+                scratch);
     }
   }
 }
+
+std::int64_t tile_rows() { return kTileRows; }
 
 }  // namespace
 }  // namespace lvggt::kernels::HWY_NAMESPACE
@@ -126,13 +167,14 @@ HWY_AFTER_NAMESPACE();
 namespace lvggt::kernels {
 
 HWY_EXPORT(run_chunk);
+HWY_EXPORT(tile_rows);
 
 void run_product(const Product& product, FunctionRef<void(const RowTable&)> gather, Context& ctx) {
   const PackedMatrix& w = *product.w;
   const std::int64_t panels = num_panels(w.N);
   if (product.M == 0 || panels == 0) return;
-  const std::int64_t row_chunks = (product.M + kChunkRows - 1) / kChunkRows;
-  const std::int64_t panel_chunks = (panels + kChunkPanels - 1) / kChunkPanels;
+  const Chunks chunks =
+      plan_chunks(product.M, panels, HWY_DYNAMIC_DISPATCH(tile_rows)(), ctx.num_threads());
 
   Arena::Scope scope(ctx.arena());
   const std::int64_t workers = ctx.num_threads();
@@ -147,13 +189,13 @@ void run_product(const Product& product, FunctionRef<void(const RowTable&)> gath
   const auto residual_rows = ctx.arena().alloc<const float*>(Shape{workers, kChunkRows});
 
   const auto run = HWY_DYNAMIC_DISPATCH(run_chunk);
-  // Chunks of the same rows follow each other, so that a thread finds the rows in its cache.
   parallel_chunks(
-      row_chunks * panel_chunks,
+      chunks.count(),
       [&](std::int64_t chunk, int worker) {
+        const Chunks::Range rows = chunks.rows_of(chunk);
         RowTable table;
-        table.begin = chunk / panel_chunks * kChunkRows;
-        table.count = std::min(kChunkRows, product.M - table.begin);
+        table.begin = rows.begin;
+        table.count = rows.end - rows.begin;
         table.capacity = kChunkRows;
         table.x = x_rows[worker].data();
         table.y = y_rows[worker].data();
@@ -164,8 +206,8 @@ void run_product(const Product& product, FunctionRef<void(const RowTable&)> gath
           const float** row = table.x + t * kChunkRows;
           std::fill(row + table.count, row + kChunkRows, row[table.count - 1]);
         }
-        const std::int64_t panel0 = chunk % panel_chunks * kChunkPanels;
-        run(product, table, panel0, std::min(panels, panel0 + kChunkPanels),
+        const Chunks::Range panel_range = chunks.panels_of(chunk);
+        run(product, table, panel_range.begin, panel_range.end,
             {inputs[worker].data(), sums[worker].data(), input_rows[worker].data(),
              widened[worker].data()});
       },

@@ -4,6 +4,7 @@
 
 #include <cstdint>
 
+#include "kernels/chunks.h"
 #include "lvggt/core/context.h"
 #include "lvggt/core/parallel.h"
 #include "lvggt/kernels/epilogue.h"
@@ -11,14 +12,6 @@
 
 namespace lvggt::kernels {
 
-// A chunk is the unit of parallel work and of reuse: kChunkRows rows times kChunkPanels panels.
-//  - its inputs for one K block (96 x 256 floats, 96 KiB) and its sums (96 x 384 floats, 144 KiB)
-//  stay in a
-//    second-level cache of 512 KiB together with the panels in use;
-//  - a panel line group is read from there once for all 96 rows;
-//  - 782 tokens x 3072 channels give 72 chunks: enough for dozens of threads to balance.
-inline constexpr std::int64_t kChunkRows = 96;  // a multiple of every tile's rows
-inline constexpr std::int64_t kChunkPanels = 24;
 // Lines of a panel summed before moving on: 256 lines of one panel are 16 KiB, half of a
 // first-level cache.
 inline constexpr std::int64_t kBlockK = 256;

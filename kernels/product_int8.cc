@@ -138,6 +138,8 @@ void dequantize(const Product& p, const QuantizedRows& x, std::int64_t row0, std
   }
 }
 
+std::int64_t int8_tile_rows() { return kInt8Rows; }
+
 // One chunk: all of K for the rows of the table and panels [panel0, panel1).
 void run_int8_chunk(const Product& p, const QuantizedRows& x, const RowTable& table,
                     std::int64_t panel0, std::int64_t panel1, float* sums) {
@@ -177,6 +179,7 @@ namespace lvggt::kernels {
 
 HWY_EXPORT(quantize_row);
 HWY_EXPORT(run_int8_chunk);
+HWY_EXPORT(int8_tile_rows);
 
 void run_product_int8(const Product& product, View<const float, 2> x,
                       FunctionRef<void(const RowTable&)> gather, Context& ctx) {
@@ -206,23 +209,24 @@ void run_product_int8(const Product& product, View<const float, 2> x,
   const auto x_rows = ctx.arena().alloc<const float*>(Shape{workers, kChunkRows});
   const auto y_rows = ctx.arena().alloc<float*>(Shape{workers, kChunkRows});
   const auto residual_rows = ctx.arena().alloc<const float*>(Shape{workers, kChunkRows});
-  const std::int64_t panel_chunks = (panels + kChunkPanels - 1) / kChunkPanels;
+  const Chunks chunks = plan_chunks(M, panels, HWY_DYNAMIC_DISPATCH(int8_tile_rows)(), workers);
   const auto run = HWY_DYNAMIC_DISPATCH(run_int8_chunk);
-  parallel_chunks((M + kChunkRows - 1) / kChunkRows * panel_chunks,
-                  [&](std::int64_t chunk, int worker) {
-                    RowTable table;
-                    table.begin = chunk / panel_chunks * kChunkRows;
-                    table.count = std::min(kChunkRows, M - table.begin);
-                    table.capacity = kChunkRows;
-                    table.x = x_rows[worker].data();
-                    table.y = y_rows[worker].data();
-                    table.residual = residual_rows[worker].data();
-                    gather(table);
-                    const std::int64_t panel0 = chunk % panel_chunks * kChunkPanels;
-                    run(product, quantized, table, panel0, std::min(panels, panel0 + kChunkPanels),
-                        sums[worker].data());
-                  },
-                  ctx);
+  parallel_chunks(
+      chunks.count(),
+      [&](std::int64_t chunk, int worker) {
+        const Chunks::Range rows = chunks.rows_of(chunk);
+        RowTable table;
+        table.begin = rows.begin;
+        table.count = rows.end - rows.begin;
+        table.capacity = kChunkRows;
+        table.x = x_rows[worker].data();
+        table.y = y_rows[worker].data();
+        table.residual = residual_rows[worker].data();
+        gather(table);
+        const Chunks::Range panel_range = chunks.panels_of(chunk);
+        run(product, quantized, table, panel_range.begin, panel_range.end, sums[worker].data());
+      },
+      ctx);
 }
 
 }  // namespace lvggt::kernels

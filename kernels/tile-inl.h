@@ -78,11 +78,15 @@ HWY_NOINLINE void tile(const float* const* HWY_RESTRICT rows, std::int64_t row_t
   }
 }
 
+constexpr std::int64_t num_panel_groups(std::int64_t num_panels) {
+  return (num_panels + kTilePanels - 1) / kTilePanels;
+}
+
 // Splits num_panels into groups of at most kTilePanels, as even as possible, and calls group(first,
 // count).
 template <class Group>
 HWY_INLINE void for_panel_groups(std::int64_t num_panels, const Group& group) {
-  const std::int64_t groups = (num_panels + kTilePanels - 1) / kTilePanels;
+  const std::int64_t groups = num_panel_groups(num_panels);
   std::int64_t first = 0;
   for (std::int64_t g = 0; g < groups; ++g) {
     const std::int64_t count = num_panels / groups + (g < num_panels % groups ? 1 : 0);
