@@ -110,21 +110,15 @@ void run_block(const Product& p, const RowTable& table, std::int64_t panel0, std
     float* sums = scratch.sums + first * kPanelWidth;
     const std::int64_t n0 = panel * kPanelWidth;
     const std::int64_t n1 = std::min(p.w->N, n0 + count * kPanelWidth);
-    for (std::int64_t tile = 0; tile < tiles; ++tile) {
-      next.fetch_part(tile);
-      const std::int64_t r = tile * kTileRows;
-      float* out = sums + r * kSumPitch;
-      if (block.is_first) {
-        tile_of<false>(count, block.rows + r, block.row_stride, block.taps, block.K, panels.lines,
-                       panels.stride, out, kSumPitch);
-      } else {
-        tile_of<true>(count, block.rows + r, block.row_stride, block.taps, block.K, panels.lines,
-                      panels.stride, out, kSumPitch);
-      }
-      if (block.is_last) {
-        finish_any(p, table, sums, r, std::min(table.count, r + kTileRows), n0, n1);
-      }
+    const TileColumn column{block.rows,    table.count, block.row_stride,
+                            block.taps,    block.K,     panels.lines,
+                            panels.stride, sums,        kSumPitch};
+    if (block.is_first) {
+      tile_column_of<false>(count, column, next, 0);
+    } else {
+      tile_column_of<true>(count, column, next, 0);
     }
+    if (block.is_last) finish_any(p, table, sums, 0, table.count, n0, n1);
   });
 }
 

@@ -9,6 +9,7 @@
 
 #include <cstdint>
 
+#include "kernels/prefetch-inl.h"
 #include "kernels/simd-inl.h"
 #include "lvggt/kernels/packed_matrix.h"
 
@@ -29,52 +30,73 @@ inline constexpr int kTileRows = kLanes == 16 ? 8 : (kLanes == 8 || kManyRegiste
 inline constexpr int kTilePanels = kLanes == 16 ? 3 : 1;
 inline constexpr int kPanelVectors = static_cast<int>(kPanelWidth) / kLanes;
 
+// The operands of one column of tiles: num_rows rows times a few panels.
+struct TileColumn {
+  const float* const* rows;  // [taps, row_table_stride], addresses of [K] values
+  std::int64_t num_rows;
+  std::int64_t row_table_stride;
+  std::int64_t taps;
+  std::int64_t K;
+  const float* panels;        // lines of 16, taps * K a panel
+  std::int64_t panel_stride;  // floats between two panels
+  float* out;                 // [num_rows rounded up to kTileRows, out_stride]
+  std::int64_t out_stride;
+};
+
 // out[r][n] (+)= sum over taps t and k < K of rows[t * row_table_stride + r][k] * panels[n / 16][t
 // * K + k][n % 16]
-//   for r < kTileRows and n < 16 kPanels; panels are panel_stride floats apart. All rows are read:
-//   callers point the ones beyond the matrix at any readable row and drop their sums.
+//   for r < num_rows and n < 16 kPanels. Rows are read in whole tiles: callers point the ones
+//   beyond the matrix at any readable row and drop their sums.
+// `next` is fetched meanwhile, from its part `part` on, one a tile.
 // Not inlined: surrounded by other code, the row addresses no longer fit the registers, and
 // reloading them at each step costs a fifth of the speed (measured with 16 registers).
 template <int kPanels, bool kAccumulate>
-HWY_NOINLINE void tile(const float* const* HWY_RESTRICT rows, std::int64_t row_table_stride,
-                       std::int64_t taps, std::int64_t K, const float* HWY_RESTRICT panels,
-                       std::int64_t panel_stride, float* HWY_RESTRICT out,
-                       std::int64_t out_stride) {
+HWY_NOINLINE void tile_column(const TileColumn& column, const Prefetch& next, std::int64_t part) {
   constexpr int kVectors = kPanels * kPanelVectors;
   const Floats d;
-  hn::Vec<Floats> sum[kTileRows][kVectors];
+  const std::int64_t K = column.K, out_stride = column.out_stride;
+  const std::int64_t panel_stride = column.panel_stride;
+  float* HWY_RESTRICT out = column.out;
+  for (std::int64_t first = 0; first < column.num_rows; first += kTileRows) {
+    next.fetch_part(part++);
+    hn::Vec<Floats> sum[kTileRows][kVectors];
 #pragma GCC unroll 8
-  for (int r = 0; r < kTileRows; ++r) {
-#pragma GCC unroll 8
-    for (int v = 0; v < kVectors; ++v) {
-      sum[r][v] = kAccumulate ? hn::LoadU(d, out + r * out_stride + v * kLanes) : hn::Zero(d);
-    }
-  }
-  for (std::int64_t t = 0; t < taps; ++t) {
-    const float* HWY_RESTRICT row[kTileRows];
-#pragma GCC unroll 8
-    for (int r = 0; r < kTileRows; ++r) row[r] = rows[t * row_table_stride + r];
-    const float* HWY_RESTRICT line = panels + t * K * kPanelWidth;
-#pragma GCC unroll 1
-    for (std::int64_t k = 0; k < K; ++k, line += kPanelWidth) {
-      hn::Vec<Floats> b[kVectors];
+    for (int r = 0; r < kTileRows; ++r) {
 #pragma GCC unroll 8
       for (int v = 0; v < kVectors; ++v) {
-        b[v] =
-            hn::LoadU(d, line + (v / kPanelVectors) * panel_stride + (v % kPanelVectors) * kLanes);
-      }
-#pragma GCC unroll 8
-      for (int r = 0; r < kTileRows; ++r) {
-        const auto a = hn::Set(d, row[r][k]);
-#pragma GCC unroll 8
-        for (int v = 0; v < kVectors; ++v) sum[r][v] = hn::MulAdd(a, b[v], sum[r][v]);
+        sum[r][v] = kAccumulate ? hn::LoadU(d, out + r * out_stride + v * kLanes) : hn::Zero(d);
       }
     }
-  }
+    for (std::int64_t t = 0; t < column.taps; ++t) {
+      const float* HWY_RESTRICT row[kTileRows];
 #pragma GCC unroll 8
-  for (int r = 0; r < kTileRows; ++r) {
+      for (int r = 0; r < kTileRows; ++r) {
+        row[r] = column.rows[t * column.row_table_stride + first + r];
+      }
+      const float* HWY_RESTRICT line = column.panels + t * K * kPanelWidth;
+#pragma GCC unroll 1
+      for (std::int64_t k = 0; k < K; ++k, line += kPanelWidth) {
+        hn::Vec<Floats> b[kVectors];
 #pragma GCC unroll 8
-    for (int v = 0; v < kVectors; ++v) hn::StoreU(sum[r][v], d, out + r * out_stride + v * kLanes);
+        for (int v = 0; v < kVectors; ++v) {
+          b[v] = hn::LoadU(
+              d, line + (v / kPanelVectors) * panel_stride + (v % kPanelVectors) * kLanes);
+        }
+#pragma GCC unroll 8
+        for (int r = 0; r < kTileRows; ++r) {
+          const auto a = hn::Set(d, row[r][k]);
+#pragma GCC unroll 8
+          for (int v = 0; v < kVectors; ++v) sum[r][v] = hn::MulAdd(a, b[v], sum[r][v]);
+        }
+      }
+    }
+#pragma GCC unroll 8
+    for (int r = 0; r < kTileRows; ++r) {
+#pragma GCC unroll 8
+      for (int v = 0; v < kVectors; ++v)
+        hn::StoreU(sum[r][v], d, out + r * out_stride + v * kLanes);
+    }
+    out += kTileRows * out_stride;
   }
 }
 
@@ -95,23 +117,15 @@ HWY_INLINE void for_panel_groups(std::int64_t num_panels, const Group& group) {
   }
 }
 
-// tile() for a number of panels known at run time, at most kTilePanels.
+// tile_column() for a number of panels known at run time, at most kTilePanels.
 template <bool kAccumulate>
-HWY_INLINE void tile_of(std::int64_t num_panels, const float* const* HWY_RESTRICT rows,
-                        std::int64_t row_table_stride, std::int64_t taps, std::int64_t K,
-                        const float* HWY_RESTRICT panels, std::int64_t panel_stride,
-                        float* HWY_RESTRICT out, std::int64_t out_stride) {
+HWY_INLINE void tile_column_of(std::int64_t num_panels, const TileColumn& column,
+                               const Prefetch& next, std::int64_t part) {
   if constexpr (kTilePanels >= 3) {
-    if (num_panels == 3) {
-      return tile<3, kAccumulate>(rows, row_table_stride, taps, K, panels, panel_stride, out,
-                                  out_stride);
-    }
-    if (num_panels == 2) {
-      return tile<2, kAccumulate>(rows, row_table_stride, taps, K, panels, panel_stride, out,
-                                  out_stride);
-    }
+    if (num_panels == 3) return tile_column<3, kAccumulate>(column, next, part);
+    if (num_panels == 2) return tile_column<2, kAccumulate>(column, next, part);
   }
-  tile<1, kAccumulate>(rows, row_table_stride, taps, K, panels, panel_stride, out, out_stride);
+  tile_column<1, kAccumulate>(column, next, part);
 }
 
 }  // namespace lvggt::kernels::HWY_NAMESPACE
