@@ -243,6 +243,7 @@ void State::run() {
 Batch::Batch(std::unique_ptr<loader_detail::Buffers> buffers,
              std::weak_ptr<loader_detail::State> home)
     : buffers_(std::move(buffers)), home_(std::move(home)) {}
+Batch::Batch() = default;
 Batch::Batch(Batch&&) noexcept = default;
 
 Batch& Batch::operator=(Batch&& other) noexcept {

@@ -85,10 +85,11 @@ TrainingSet TrainingSet::open(const TrainingSetOptions& options, Context& ctx) {
   set.options_ = options;
   std::set<std::string> seen;
   for (const std::string& path : options.scenes) {
-    std::error_code ignored;
-    if (!seen.insert(std::filesystem::weakly_canonical(path, ignored).string()).second)
-      fail(ErrorKind::kUsage, path, ": the scene is given twice");
     set.add_scene(path);
+    std::error_code ignored;
+    const std::string& same = set.scenes_.back().path();
+    if (!seen.insert(std::filesystem::weakly_canonical(same, ignored).string()).second)
+      fail(ErrorKind::kUsage, path, ": the scene is given twice");
   }
   set.check_samples(ctx);
   return set;

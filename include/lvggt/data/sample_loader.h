@@ -49,7 +49,7 @@ struct State;
 // the loader for another batch when it is destroyed (and outlives the loader if need be).
 class Batch {
  public:
-  Batch() = default;
+  Batch();
   Batch(Batch&&) noexcept;
   Batch& operator=(Batch&&) noexcept;
   ~Batch();
