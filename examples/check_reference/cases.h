@@ -16,7 +16,7 @@ void check_stream(Comparison& comparison, const lvggt::LoadOptions& load,
 void check_clip(Comparison& comparison, const lvggt::LoadOptions& load, lvggt::BatchMode mode,
                 lvggt::Context& ctx);
 
-// ops: single operators; what only training needs is skipped.
+// ops: single operators, forward and, where the decoder has them, backward.
 void check_ops(Comparison& comparison, lvggt::Context& ctx);
 
 // preprocess: image loading.

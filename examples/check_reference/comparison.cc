@@ -128,9 +128,9 @@ void Comparison::add_failure(const std::string& name, const std::string& note) {
   ok_ = false;
 }
 
-void Comparison::skip(const std::string& name) {
+void Comparison::skip(const std::string& name, const std::string& why) {
   if (!wants(name) || !seen_.insert(name).second) return;
-  lines_.push_back({name, 0, 0, 0, Verdict::kSkipped, "part of training"});
+  lines_.push_back({name, 0, 0, 0, Verdict::kSkipped, why});
 }
 
 void Comparison::finish() {

@@ -34,8 +34,8 @@ class Comparison {
 
   // A tensor that needs no check: an input, a weight, a statement about the reference itself.
   void accept(const std::string& name) { seen_.insert(name); }
-  // A tensor that only training produces; it is listed, but fails nothing.
-  void skip(const std::string& name);
+  // A tensor that is not computed, and why; it is listed, but fails nothing.
+  void skip(const std::string& name, const std::string& why);
 
   // Fails every tensor that nothing was computed for; call once, at the end.
   void finish();

@@ -5,6 +5,7 @@
 #include <cmath>
 
 #include "examples/check_reference/cases.h"
+#include "examples/check_reference/operands.h"
 #include "lvggt/kernels/activation.h"
 #include "lvggt/kernels/batch_norm2d.h"
 
@@ -12,73 +13,6 @@ namespace check_reference {
 namespace {
 
 using namespace lvggt;
-
-// Reads the operands of one operator, maps as channels last.
-class Operands {
- public:
-  Operands(Comparison& comparison, const std::string& op, Context& ctx)
-      : comparison_(comparison), op_(op), ctx_(ctx) {}
-
-  Context& ctx() const { return ctx_; }
-  const std::string& op() const { return op_; }
-  const Safetensors& file() const { return comparison_.file(); }
-  bool has(const std::string& name) const { return comparison_.wants(op_ + "." + name); }
-
-  template <int R>
-  Tensor<float, R> get(const std::string& name) const {
-    comparison_.accept(op_ + "." + name);
-    return file().read<R>(op_ + "." + name);
-  }
-  Tensor<float, 1> get_if_there(const std::string& name) const {
-    return has(name) ? get<1>(name) : Tensor<float, 1>();
-  }
-  Tensor<float, 4> get_map(const std::string& name) const {
-    const Tensor<float, 4> planes = get<4>(name);
-    const auto [B, C, H, W] = planes.shape();
-    Tensor<float, 4> map(Shape{B, H, W, C});
-    for (std::int64_t b = 0; b < B; ++b) from_planes(map[b], planes[b], ctx_);
-    return map;
-  }
-  // [1, heads, N, D] as [N, heads, D]
-  Tensor<float, 3> get_heads(const std::string& name) const {
-    const Tensor<float, 4> x = get<4>(name);
-    Tensor<float, 3> y(Shape{x.extent(2), x.extent(1), x.extent(3)});
-    for (std::int64_t head = 0; head < x.extent(1); ++head)
-      for (std::int64_t n = 0; n < x.extent(2); ++n)
-        std::copy_n(&x(std::int64_t{0}, head, n, std::int64_t{0}), x.extent(3),
-                    &y(n, head, std::int64_t{0}));
-    return y;
-  }
-  Shape<4> output_shape() const {  // [B, H, W, C] of the file's [B, C, H, W]
-    const std::vector<std::int64_t>& s = file().at(op_ + ".y").shape;
-    LVGGT_CHECK(s.size() == 4, file().path(), ": ", op_, ".y is ", shape_text(s), ", not a map");
-    return {s[0], s[2], s[3], s[1]};
-  }
-
-  template <int R>
-  void compare(const Tensor<float, R>& y, const std::string& name = "y") const {
-    comparison_.compare(op_ + "." + name, y);
-  }
-  void compare_map(const Tensor<float, 4>& map) const {
-    const auto [B, H, W, C] = map.shape();
-    Tensor<float, 4> planes(Shape{B, C, H, W});
-    for (std::int64_t b = 0; b < B; ++b) to_planes(planes[b], map[b], ctx_);
-    compare(planes);
-  }
-  void compare_heads(const Tensor<float, 3>& y) const {
-    const auto [N, heads, D] = y.shape();
-    Tensor<float, 3> dump(Shape{heads, N, D});
-    for (std::int64_t n = 0; n < N; ++n)
-      for (std::int64_t head = 0; head < heads; ++head)
-        std::copy_n(&y(n, head, std::int64_t{0}), D, &dump(head, n, std::int64_t{0}));
-    compare(dump);
-  }
-
- private:
-  Comparison& comparison_;
-  std::string op_;
-  Context& ctx_;
-};
 
 void check_linear(const Operands& o) {
   const Tensor<float, 2> x = o.get<2>("x"), w = o.get<2>("w");
@@ -120,15 +54,9 @@ void check_layer_norm(const Operands& o) {
   o.compare(y);
 }
 
-// Names carry kernel, stride and padding: conv3x3_s2p1_odd, conv1x1, conv14x14_s14.
 void check_conv2d(const Operands& o) {
   const Tensor<float, 4> x = o.get_map("x"), w = o.get<4>("w");
-  const auto number_after = [&](const std::string& text, std::int64_t absent) {
-    const std::size_t at = o.op().find(text);
-    return at == std::string::npos ? absent : std::atoll(o.op().c_str() + at + text.size());
-  };
-  const std::int64_t stride = number_after("_s", 1);
-  const std::int64_t padding = o.op().find("p1") != std::string::npos ? 1 : 0;
+  const auto [stride, padding] = o.stride_and_padding();
   const Tensor<float, 1> bias = o.get_if_there("b");
   Tensor<float, 4> y(Shape{x.extent(0), conv2d_extent(x.extent(1), w.extent(2), stride, padding),
                            conv2d_extent(x.extent(2), w.extent(2), stride, padding), w.extent(0)});
@@ -145,31 +73,28 @@ void check_conv_transpose2d(const Operands& o) {
   o.compare_map(y);
 }
 
-// Inference folds a batch norm into the convolution before it; here that is the identity.
+// In training a batch norm takes the statistics of the batch, which move the running ones.
+// Inference folds it into the convolution before it; here that is the identity.
 void check_batch_norm(const Operands& o) {
-  const bool rows = o.file().at(o.op() + ".x").shape.size() == 2;
-  Tensor<float, 4> x;
-  if (rows) {
-    const Tensor<float, 2> flat = o.get<2>("x");
-    x = Tensor<float, 4>(Shape{std::int64_t{1}, std::int64_t{1}, flat.extent(0), flat.extent(1)});
-    std::copy_n(flat.data(), flat.size(), x.data());
-  } else {
-    x = o.get_map("x");
-  }
+  constexpr float kEps = 1e-5f, kMomentum = 0.1f;
+  const Tensor<float, 4> x = o.get_map("x");
   const std::int64_t C = x.extent(3);
-  Tensor<float, 4> weight(Shape{C, C, std::int64_t{1}, std::int64_t{1}});
-  for (std::int64_t c = 0; c < C; ++c) weight(c, c, 0, 0) = 1;
-  Tensor<float, 1> bias(Shape{C});
-  const Tensor<float, 1> mean = o.get<1>("running_mean_in"), var = o.get<1>("running_var_in");
-  batch_norm2d_fold(weight, bias, o.get<1>("w"), o.get<1>("b"), mean, var, 1e-5f);
+  const Tensor<float, 1> gamma = o.get<1>("w"), beta = o.get<1>("b");
+  Tensor<float, 1> mean = o.get<1>("running_mean_in"), var = o.get<1>("running_var_in");
   Tensor<float, 4> y(x.shape());
-  conv2d_forward(y, x, pack_conv2d(weight, 1, 0), {.bias = bias.view()}, o.ctx());
-  if (rows) {
-    o.compare(y);
+  if (o.op().ends_with("_train")) {
+    Tensor<float, 1> batch_mean(Shape{C}), batch_rstd(Shape{C});
+    batch_norm2d_forward(y, batch_mean, batch_rstd, mean, var, x, gamma, beta, kEps, kMomentum,
+                         Activation::kNone, o.ctx());
   } else {
-    o.compare_map(y);
+    Tensor<float, 4> weight(Shape{C, C, std::int64_t{1}, std::int64_t{1}});
+    for (std::int64_t c = 0; c < C; ++c) weight(c, c, 0, 0) = 1;
+    Tensor<float, 1> bias(Shape{C});
+    batch_norm2d_fold(weight, bias, gamma, beta, mean, var, kEps);
+    conv2d_forward(y, x, pack_conv2d(weight, 1, 0), {.bias = bias.view()}, o.ctx());
   }
-  o.compare(mean, "running_mean_out");  // evaluation leaves them as they are
+  o.compare_map(y);
+  o.compare(mean, "running_mean_out");
   o.compare(var, "running_var_out");
 }
 
@@ -334,13 +259,14 @@ void check_cameras(const Operands& o, Comparison& comparison) {
   if (unprojects) comparison.compare("unproject.y", points);
 }
 
-// Whether a name is a gradient (dx, dparam.*), or belongs to an operator that only training has.
-bool training_only(const std::string& op, const std::string& field) {
-  static const char* const kGradients[] = {"dx", "dy", "dw", "db", "da", "dq", "dk", "dv", "dskip"};
-  if (field.starts_with("dparam.")) return true;
-  if (std::find(std::begin(kGradients), std::end(kGradients), field) != std::end(kGradients))
-    return true;
-  return op.starts_with("loss_") || op == "adamw" || op.ends_with("_train");
+// Why nothing is computed for a tensor, or null: the geometry model is frozen, so its operators
+// have no gradients, and the optimiser's steps are no operator.
+const char* why_skipped(const std::string& op, const std::string& field) {
+  static const char* const kFrozen[] = {"attention", "rope2d", "block_", "softmax", "activate_"};
+  if (op == "adamw") return "part of the optimiser";
+  const bool frozen = std::any_of(std::begin(kFrozen), std::end(kFrozen),
+                                  [&](const char* name) { return op.starts_with(name); });
+  return frozen && field.starts_with("d") ? "the geometry model is not trained" : nullptr;
 }
 
 void check_op(Comparison& comparison, const std::string& op, Context& ctx) {
@@ -377,6 +303,7 @@ void check_op(Comparison& comparison, const std::string& op, Context& ctx) {
   if (op == "activate_depth") return check_dense_activation(o, false);
   if (op == "activate_points") return check_dense_activation(o, true);
   if (op == "camera") return check_cameras(o, comparison);
+  if (starts("loss_")) return check_loss(o, comparison);
 }
 
 }  // namespace
@@ -386,13 +313,18 @@ void check_ops(Comparison& comparison, Context& ctx) {
   for (const TensorEntry& entry : comparison.file().entries()) {
     const std::size_t dot = entry.name.find('.');
     const std::string op = entry.name.substr(0, dot);
-    if (dot != std::string::npos && training_only(op, entry.name.substr(dot + 1))) {
-      comparison.skip(entry.name);
+    const char* why =
+        dot == std::string::npos ? nullptr : why_skipped(op, entry.name.substr(dot + 1));
+    if (why) {
+      comparison.skip(entry.name, why);
     } else {
       ops.insert(op);
     }
   }
-  for (const std::string& op : ops) check_op(comparison, op, ctx);
+  for (const std::string& op : ops) {
+    check_op(comparison, op, ctx);
+    check_op_backward(Operands(comparison, op, ctx));
+  }
 }
 
 }  // namespace check_reference
