@@ -68,6 +68,14 @@ TEST_CASE("IouCounter: pools frames and leaves unlabelled pixels out") {
   CHECK(*counter.iou(0) == doctest::Approx(3.0 / 4));
   CHECK(*counter.iou(1) == doctest::Approx(1.0 / 2));
   CHECK(*counter.mean_iou() == doctest::Approx(5.0 / 8));
+
+  std::vector<double> twice = counter.counts();
+  for (double& count : twice) count *= 2;
+  IouCounter sum(3);
+  sum.set_counts(twice);
+  CHECK(*sum.mean_iou() == *counter.mean_iou());
+  CHECK(sum.counts() == twice);
+  CHECK_THROWS(sum.set_counts(std::vector<double>(4)));
 }
 
 TEST_CASE(

@@ -28,8 +28,8 @@ inline void handle(int) {
 
 }  // namespace interrupt_detail
 
-// While it lives, the first SIGINT, SIGTERM or SIGHUP only sets a flag for the program to look at;
-// the second ends the process at once with status 130.
+// While it lives, the first SIGINT, SIGTERM, SIGHUP or SIGUSR1 (which mpirun passes on to its ranks)
+// only sets a flag for the program to look at; the second ends the process at once with status 130.
 class InterruptGuard {
  public:
   InterruptGuard() {
@@ -53,8 +53,8 @@ class InterruptGuard {
   bool requested() const { return interrupt_detail::requested != 0; }
 
  private:
-  static constexpr std::array<int, 3> kSignals{SIGINT, SIGTERM, SIGHUP};
-  std::array<struct sigaction, 3> before_{};
+  static constexpr std::array<int, 4> kSignals{SIGINT, SIGTERM, SIGHUP, SIGUSR1};
+  std::array<struct sigaction, 4> before_{};
 };
 
 }  // namespace lvggt::cli

@@ -143,6 +143,23 @@ class IouCounter {
       }
   }
 
+  // The counts as numbers that can be summed over ranks, and back.
+  std::vector<double> counts() const {
+    std::vector<double> values;
+    for (const auto* pixels : {&both_, &truth_, &predicted_})
+      values.insert(values.end(), pixels->begin(), pixels->end());
+    return values;
+  }
+  void set_counts(std::span<const double> values) {
+    LVGGT_CHECK(values.size() == 3 * both_.size(), "intersection over union: ", values.size(),
+                " counts are not those of ", both_.size(), " classes");
+    for (auto* pixels : {&both_, &truth_, &predicted_})
+      for (std::int64_t& count : *pixels) {
+        count = static_cast<std::int64_t>(values.front());
+        values = values.subspan(1);
+      }
+  }
+
   // Nothing for a class that is neither there nor predicted.
   std::optional<double> iou(std::size_t c) const {
     const std::int64_t together = truth_[c] + predicted_[c] - both_[c];
