@@ -50,6 +50,8 @@ void block_shapes(benchmark::internal::Benchmark* b) {
     b->Args({M, kDim, 4 * kDim, 0});
   }
   b->Args({kTokens, kDim, kDim, 1});
+  b->Args({kTokens, 4 * kDim, kDim, 1});
+  b->Args({kTokens, kDim, 4 * kDim, 1});
   b->Args({1, 6 * kDim, 2 * kDim, 0});  // the camera head's qkv for one token
 }
 

@@ -89,6 +89,10 @@ struct Block {
   std::int64_t line;  // where the block starts inside a panel
   bool is_first;
   bool is_last;
+  // Inputs that the next block copies: bytes [next_offset, next_offset + next_bytes) of next_rows.
+  const float* const* next_rows = nullptr;
+  std::int64_t next_offset = 0;
+  std::int64_t next_bytes = 0;
 };
 
 void run_block(const Product& p, const RowTable& table, std::int64_t panel0, std::int64_t panel1,
@@ -106,6 +110,12 @@ void run_block(const Product& p, const RowTable& table, std::int64_t panel0, std
       const std::int64_t line = block.line + lines;
       next = prefetch_panels(p, panel0, std::min<std::int64_t>(kTilePanels, panel1 - panel0), line,
                              std::min(lines, p.taps * p.K - line), tiles);
+    }
+    if (block.next_rows != nullptr) {  // a share of the rows during each group of panels
+      const std::int64_t groups = num_panel_groups(panel1 - panel0),
+                         group = first * groups / (panel1 - panel0);
+      next.add_rows(block.next_rows, table.count * group / groups,
+                    table.count * (group + 1) / groups, block.next_offset, block.next_bytes, tiles);
     }
     float* sums = scratch.sums + first * kPanelWidth;
     const std::int64_t n0 = panel * kPanelWidth;
@@ -134,10 +144,20 @@ void run_chunk(const Product& p, const RowTable& table, std::int64_t panel0, std
         const std::int64_t k0 = K * b / blocks;
         const std::int64_t k1 = K * (b + 1) / blocks;
         copy_inputs(table, t, k0, k1, scratch);
-        run_block(p, table, panel0, panel1,
-                  {scratch.input_rows, 0, 1, k1 - k0, t * K + k0, t == 0 && b == 0,
-                   t == taps - 1 && b == blocks - 1},
-                  scratch);
+        Block block{scratch.input_rows,
+                    0,
+                    1,
+                    k1 - k0,
+                    t * K + k0,
+                    t == 0 && b == 0,
+                    t == taps - 1 && b == blocks - 1};
+        if (!block.is_last) {
+          const std::int64_t next_tap = b + 1 < blocks ? t : t + 1, next_b = (b + 1) % blocks;
+          block.next_rows = table.x + next_tap * table.capacity;
+          block.next_offset = K * next_b / blocks * 4;
+          block.next_bytes = K * (next_b + 1) / blocks * 4 - block.next_offset;
+        }
+        run_block(p, table, panel0, panel1, block, scratch);
       }
     }
   } else {  // several taps in one block, read where they are
