@@ -5,6 +5,7 @@
 
 #include "kernels/pack.h"
 #include "kernels/product.h"
+#include "kernels/tap_gather.h"
 
 namespace lvggt {
 
@@ -27,59 +28,6 @@ PackedConv2d pack_conv2d(View<const float, 4> weight, std::int64_t stride, std::
   return packed;
 }
 
-namespace {
-
-// Addresses of the pixels that the taps of output row m read. Beyond the border they read `zeros`.
-class ConvGather {
- public:
-  // merged: without padding, the taps of one kernel row lie side by side and are read as one.
-  ConvGather(View<float, 4> y, View<const float, 4> x, View<const float, 4> residual,
-             const PackedConv2d& w, bool merged, const float* zeros)
-      : y_(y), x_(x), residual_(residual), w_(w), taps_x_(merged ? 1 : w.kernel), zeros_(zeros) {}
-
-  void operator()(const kernels::RowTable& table) const {
-    const std::int64_t Ho = y_.extent(1), Wo = y_.extent(2);
-    std::int64_t ox = table.begin % Wo;
-    std::int64_t oy = table.begin / Wo % Ho;
-    std::int64_t b = table.begin / Wo / Ho;
-    for (std::int64_t r = 0; r < table.count; ++r) {
-      table.y[r] = y_.data() + b * y_.stride(0) + oy * y_.stride(1) + ox * y_.stride(2);
-      if (residual_) {
-        table.residual[r] = residual_.data() + b * residual_.stride(0) + oy * residual_.stride(1) +
-                            ox * residual_.stride(2);
-      }
-      for (std::int64_t ky = 0; ky < w_.kernel; ++ky) {
-        for (std::int64_t kx = 0; kx < taps_x_; ++kx) {
-          table.x[(ky * taps_x_ + kx) * table.capacity + r] =
-              pixel(b, oy * w_.stride - w_.padding + ky, ox * w_.stride - w_.padding + kx);
-        }
-      }
-      if (++ox == Wo) {
-        ox = 0;
-        if (++oy == Ho) {
-          oy = 0;
-          ++b;
-        }
-      }
-    }
-  }
-
- private:
-  const float* pixel(std::int64_t b, std::int64_t iy, std::int64_t ix) const {
-    if (iy < 0 || iy >= x_.extent(1) || ix < 0 || ix >= x_.extent(2)) return zeros_;
-    return x_.data() + b * x_.stride(0) + iy * x_.stride(1) + ix * x_.stride(2);
-  }
-
-  View<float, 4> y_;
-  View<const float, 4> x_;
-  View<const float, 4> residual_;
-  const PackedConv2d& w_;
-  std::int64_t taps_x_;
-  const float* zeros_;
-};
-
-}  // namespace
-
 void conv2d_forward(View<float, 4> y, View<const float, 4> x, const PackedConv2d& w,
                     const Epilogue<4>& epilogue, Context& ctx) {
   const auto [B, H, W, Cin] = x.shape();
@@ -100,6 +48,7 @@ void conv2d_forward(View<float, 4> y, View<const float, 4> x, const PackedConv2d
   Arena::Scope scope(ctx.arena());
   const View<float, 1> zeros = ctx.arena().alloc(Shape{Cin});
   std::fill_n(zeros.data(), Cin, 0.0f);
+  // Without padding, the taps of one kernel row lie side by side and are read as one.
   const bool merged = w.padding == 0 && (w.kernel == 1 || x.stride(2) == Cin);
   const kernels::Product product{B * expected[1] * expected[2],
                                  &w.matrix,
@@ -109,7 +58,10 @@ void conv2d_forward(View<float, 4> y, View<const float, 4> x, const PackedConv2d
                                  epilogue.activation,
                                  epilogue.gamma.data(),
                                  !epilogue.residual.empty()};
-  const ConvGather gather(y, x, epilogue.residual, w, merged, zeros.data());
+  const kernels::TapAxis down{w.kernel, w.stride, -w.padding, 1};
+  kernels::TapAxis across = down;
+  if (merged) across.taps = 1;
+  const kernels::TapGather gather(y, x, epilogue.residual, down, across, zeros.data());
   kernels::run_product(product, gather, ctx);
 }
 

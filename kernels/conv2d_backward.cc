@@ -4,6 +4,7 @@
 
 #include "kernels/pack.h"
 #include "kernels/product.h"
+#include "kernels/tap_gather.h"
 #include "kernels/weight_gradient.h"
 #include "lvggt/kernels/conv2d.h"
 #include "lvggt/kernels/conv_transpose2d.h"
@@ -45,18 +46,16 @@ class InputGradient {
     if (M == 0) return;
     const PackedMatrix w = packed(down, across);
     const kernels::Product product{M, &w, w.taps, w.K, nullptr, Activation::kNone, nullptr, false};
-    const auto gather = [&](const kernels::RowTable& table) {
-      for (std::int64_t r = 0; r < table.count; ++r) {
-        const std::int64_t m = table.begin + r;
-        const std::int64_t ix = phase_x + m % across.inputs * stride_;
-        const std::int64_t iy = phase_y + m / across.inputs % down.inputs * stride_;
-        const std::int64_t b = m / across.inputs / down.inputs;
-        table.y[r] = dx_.data() + b * dx_.stride(0) + iy * dx_.stride(1) + ix * dx_.stride(2);
-        for (std::int64_t t = 0; t < w.taps; ++t)
-          table.x[t * table.capacity + r] = pixel(b, iy + padding_ - tap(down, t / across.taps),
-                                                  ix + padding_ - tap(across, t % across.taps));
-      }
+    // Input p = phase + stride i reads, through its j-th tap, output i + first - j.
+    const auto axis = [&](const Phase& p, std::int64_t phase) {
+      return kernels::TapAxis{std::max<std::int64_t>(1, p.taps), 1,
+                              (phase + padding_ - p.first_tap) / stride_, -1};
     };
+    const View<float, 4> dx(dx_.data() + phase_y * dx_.stride(1) + phase_x * dx_.stride(2),
+                            Shape{dx_.extent(0), down.inputs, across.inputs, dx_.extent(3)},
+                            {dx_.stride(0), stride_ * dx_.stride(1), stride_ * dx_.stride(2), 1});
+    const kernels::TapGather gather(dx, dy_, {}, axis(down, phase_y), axis(across, phase_x),
+                                    zeros_.data());
     kernels::run_product(product, gather, ctx);
   }
 
@@ -78,14 +77,6 @@ class InputGradient {
               matrix, ci, t * Cout + co,
               weight_(co, ci, tap(down, t / across.taps), tap(across, t % across.taps)));
     return matrix;
-  }
-
-  // y and x are multiples of the stride.
-  const float* pixel(std::int64_t b, std::int64_t y, std::int64_t x) const {
-    if (y < 0 || x < 0 || y / stride_ >= dy_.extent(1) || x / stride_ >= dy_.extent(2))
-      return zeros_.data();
-    return dy_.data() + b * dy_.stride(0) + y / stride_ * dy_.stride(1) +
-           x / stride_ * dy_.stride(2);
   }
 
   View<float, 4> dx_;

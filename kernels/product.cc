@@ -23,7 +23,7 @@ struct ChunkScratch {
   float* input = nullptr;              // [kChunkRows, kInputPitch]
   float* sums = nullptr;               // [kChunkRows, kSumPitch]
   const float** input_rows = nullptr;  // [kChunkRows]
-  float* widened = nullptr;  // [kTilePanels, kBlockK, 16]: lines of narrow weights as floats
+  float* widened = nullptr;  // [kTilePanels, kMostLines, 16]: lines of narrow weights as floats
 };
 // Panels of the widest tile of any instruction set.
 inline constexpr std::int64_t kMaxTilePanels = 3;
@@ -65,9 +65,9 @@ Panels block_panels(const Product& p, std::int64_t panel, std::int64_t count, st
   }
   for (std::int64_t i = 0; i < count; ++i) {
     widen_lines(p.w->storage, p.w->panels.data() + 2 * (first + i * panel_lines * kPanelWidth),
-                num_lines, scratch.widened + i * kBlockK * kPanelWidth);
+                num_lines, scratch.widened + i * kMostLines * kPanelWidth);
   }
-  return {scratch.widened, kBlockK * kPanelWidth};
+  return {scratch.widened, kMostLines * kPanelWidth};
 }
 
 // Lines [line, line + num_lines) of `count` panels from `panel` on, as they are stored.
@@ -161,11 +161,13 @@ void run_chunk(const Product& p, const RowTable& table, std::int64_t panel0, std
       }
     }
   } else {  // several taps in one block, read where they are
-    const std::int64_t group = std::max<std::int64_t>(1, kBlockK / std::max<std::int64_t>(K, 1));
-    for (std::int64_t t = 0; t < taps; t += group) {
+    const std::int64_t group = std::max<std::int64_t>(1, kMostLines / std::max<std::int64_t>(K, 1));
+    const std::int64_t blocks = (taps + group - 1) / group;
+    for (std::int64_t b = 0; b < blocks; ++b) {
+      const std::int64_t t0 = taps * b / blocks, t1 = taps * (b + 1) / blocks;
       run_block(p, table, panel0, panel1,
-                {table.x + t * table.capacity, table.capacity, std::min(group, taps - t), K, t * K,
-                 t == 0, t + group >= taps},
+                {table.x + t0 * table.capacity, table.capacity, t1 - t0, K, t0 * K, b == 0,
+                 b == blocks - 1},
                 scratch);
     }
   }
@@ -199,7 +201,7 @@ void run_product(const Product& product, FunctionRef<void(const RowTable&)> gath
   const auto y_rows = ctx.arena().alloc<float*>(Shape{workers, kChunkRows});
   const bool narrow = w.storage != Storage::kF32;
   const auto widened =
-      ctx.arena().alloc(Shape{workers, narrow ? kMaxTilePanels * kBlockK * kPanelWidth : 0});
+      ctx.arena().alloc(Shape{workers, narrow ? kMaxTilePanels * kMostLines * kPanelWidth : 0});
   const auto residual_rows = ctx.arena().alloc<const float*>(Shape{workers, kChunkRows});
 
   const auto run = HWY_DYNAMIC_DISPATCH(run_chunk);

@@ -15,6 +15,8 @@ namespace lvggt::kernels {
 // Lines of a panel summed before moving on: 256 lines of one panel are 16 KiB, half of a
 // first-level cache.
 inline constexpr std::int64_t kBlockK = 256;
+// The same for several taps together: 9 taps of 32 channels are one block.
+inline constexpr std::int64_t kMostLines = 320;
 // Row pitch of copied inputs: not a multiple of 4 KiB, so that rows do not compete for the same
 // cache sets.
 inline constexpr std::int64_t kInputPitch = kBlockK + 16;
