@@ -65,17 +65,19 @@ Linear load_pixel_linear(const Source& c, const std::string& prefix) {
 }
 
 // A convolution with the batch norm that follows it folded in.
-inline Conv2d load_normed_conv2d(const Checkpoint& c, const std::string& conv,
-                                 const std::string& norm, double eps) {
-  Tensor<float, 4> weight = c.read<4>(conv + ".weight");
-  Tensor<float, 1> bias = c.read<1>(conv + ".bias");
-  batch_norm2d_fold(weight, bias, c.read<1>(norm + ".weight"), c.read<1>(norm + ".bias"),
-                    c.read<1>(norm + ".running_mean"), c.read<1>(norm + ".running_var"),
-                    static_cast<float>(eps));
-  return {pack_conv2d(weight, 1, 1, c.storage_of(conv + ".weight")), std::move(bias)};
+template <class Source>
+Conv2d load_normed_conv2d(const Source& c, const std::string& conv, const std::string& norm,
+                          double eps) {
+  Tensor<float, 4> weight = c.template read<4>(conv + ".weight");
+  Tensor<float, 1> bias = c.template read<1>(conv + ".bias");
+  batch_norm2d_fold(weight, bias, c.template read<1>(norm + ".weight"),
+                    c.template read<1>(norm + ".bias"), c.template read<1>(norm + ".running_mean"),
+                    c.template read<1>(norm + ".running_var"), static_cast<float>(eps));
+  return {pack_conv2d(weight, 1, 1, storage_of(c, conv + ".weight")), std::move(bias)};
 }
 
-inline DoubleConv load_double_conv(const Checkpoint& c, const std::string& prefix, double eps) {
+template <class Source>
+DoubleConv load_double_conv(const Source& c, const std::string& prefix, double eps) {
   return {load_normed_conv2d(c, prefix + ".0", prefix + ".1", eps),
           load_normed_conv2d(c, prefix + ".3", prefix + ".4", eps)};
 }
@@ -185,7 +187,8 @@ FusionBlock load_fusion_block(const Source& c, const std::string& prefix, bool w
 
 // predicts: false for a feature extractor, which ends at output_conv1 and has no position
 // embedding.
-inline DptHead load_dpt_head(const Checkpoint& c, const std::string& prefix, bool predicts) {
+template <class Source>
+DptHead load_dpt_head(const Source& c, const std::string& prefix, bool predicts) {
   const ModelConfig& config = c.config();
   DptHead head;
   Reassemble& reassemble = head.reassemble;
@@ -198,7 +201,8 @@ inline DptHead load_dpt_head(const Checkpoint& c, const std::string& prefix, boo
     const std::string number = std::to_string(i + 1);
     reassemble.projects[i] = load_pixel_linear(c, prefix + ".projects." + std::to_string(i));
     const std::string layer_rn = scratch + ".layer" + number + "_rn.weight";
-    reassemble.layer_rn[i].weight = pack_conv2d(c.read<4>(layer_rn), 1, 1, c.storage_of(layer_rn));
+    reassemble.layer_rn[i].weight =
+        pack_conv2d(c.template read<4>(layer_rn), 1, 1, storage_of(c, layer_rn));
     head.refinenet[i] = load_fusion_block(c, scratch + ".refinenet" + number, i < 3);
   }
   head.output_conv1 = load_conv2d(c, scratch + ".output_conv1", 1, 1);
@@ -218,7 +222,8 @@ inline StreamVggt load_stream_vggt(const Checkpoint& c, Context& ctx) {
   return model;
 }
 
-inline UNetEncoder load_unet_encoder(const Checkpoint& c, const std::string& prefix) {
+template <class Source>
+UNetEncoder load_unet_encoder(const Source& c, const std::string& prefix) {
   UNetEncoder encoder;
   for (std::size_t i = 0; i < 4; ++i) {
     const std::string number = std::to_string(i + 1);
@@ -228,7 +233,8 @@ inline UNetEncoder load_unet_encoder(const Checkpoint& c, const std::string& pre
   return encoder;
 }
 
-inline PixelHead load_pixel_head(const Checkpoint& c, const std::string& prefix) {
+template <class Source>
+PixelHead load_pixel_head(const Source& c, const std::string& prefix) {
   if (c.config().sbd_head == DecoderHead::kMlp)
     return MlpHead{load_conv2d(c, prefix + ".mlp.0", 1, 0),
                    load_conv2d(c, prefix + ".mlp.2", 1, 0)};
@@ -242,7 +248,8 @@ inline PixelHead load_pixel_head(const Checkpoint& c, const std::string& prefix)
   return decoder;
 }
 
-inline SemanticBridgingDecoder load_semantic_bridging_decoder(const Checkpoint& c) {
+template <class Source>
+SemanticBridgingDecoder load_semantic_bridging_decoder(const Source& c) {
   const ModelConfig& config = c.config();
   SemanticBridgingDecoder decoder;
   if (config.sbd_dpt) {

@@ -1,11 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <array>
 #include <cstdint>
 #include <optional>
 #include <string>
+#include <vector>
 
 #include "lvggt/core/context.h"
+#include "lvggt/core/tensor.h"
 #include "lvggt/model/config.h"
 #include "lvggt/train/adamw.h"
 #include "lvggt/train/communicator.h"
@@ -61,13 +64,21 @@ class DecoderTrainer {
   // Goes on after that many steps, with a store that was restored.
   void resume_at(std::int64_t steps) { steps_ = steps; }
 
+  // Makes the running statistics that the last evaluate() saw the store's, as step() does.
+  void commit_statistics();
+
   const TrainOptions& options() const { return options_; }
 
  private:
+  LossTerms run(const DecoderBatch& batch, double frames, const DecoderOutputs& outputs,
+                bool gradients, const std::array<View<float, 3>, 4>& dtaps, StepTimes& times);
+
   ParameterStore& store_;
   TrainOptions options_;
   Communicator& communicator_;
   Context& ctx_;
+  std::vector<std::string> level_names_;
+  Tensor<float, 1> running_;  // running statistics as the last pass moved them
   std::int64_t steps_ = 0;
 };
 

@@ -43,6 +43,8 @@ struct TrainOptions {
   // A batch is processed in that many parts, one after the other, their gradients added. Memory
   // shrinks with it, but batch norms then see the statistics of one part only.
   std::int64_t accumulate = 1;
+  // Batch norms use the running statistics and leave them alone.
+  bool frozen_batch_norm = false;
   // Batch statistics over the frames of all ranks; false: each rank its own, like the release.
   bool synchronise_batch_norm = true;
 };
