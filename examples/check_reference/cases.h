@@ -19,6 +19,13 @@ void check_clip(Comparison& comparison, const lvggt::LoadOptions& load, lvggt::B
 // ops: single operators, forward and, where the decoder has them, backward.
 void check_ops(Comparison& comparison, lvggt::Context& ctx);
 
+// train, train_small, train_upstream_cos: losses, gradients and steps of the decoder. `inputs` is a
+// file that holds in.*, when the comparison's own does not. The tolerances are those that the
+// reference can be compared with: train_small is free of ReLU inputs close to zero, the others are
+// not.
+void check_train(Comparison& comparison, const std::string& name, const lvggt::LoadOptions& load,
+                 const std::string& inputs, lvggt::Context& ctx);
+
 // preprocess: image loading.
 void check_preprocess(Comparison& comparison);
 

@@ -65,7 +65,7 @@ void Comparison::compare(const std::string& name, std::span<const float> values)
   }
   std::vector<float> expected(ours.size());
   file_.read_into(name, expected);
-  judge(name, ours, expected);
+  judge(name, ours, expected, tolerance_);
 
   const std::string stats_name = name + ".stats";
   if (!wants(stats_name) || values.empty()) return;
@@ -77,7 +77,75 @@ void Comparison::compare(const std::string& name, std::span<const float> values)
     add_failure(stats_name, "does not hold mean, deviation, minimum and maximum");
     return;
   }
-  judge(stats_name, stats, expected_stats);
+  judge(stats_name, stats, expected_stats, tolerance_);
+}
+
+// The file's values for a tensor that is compared now; empty when there is none, or when their
+// number is not that of ours (or above it, where a prefix will do): then the verdict is recorded.
+std::vector<float> Comparison::take(const std::string& name, std::span<const float> ours,
+                                    bool prefix) {
+  const lvggt::TensorEntry* entry = file_.find(name);
+  if (entry == nullptr || !seen_.insert(name).second) return {};
+  const auto size = static_cast<std::size_t>(entry->size());
+  if (prefix ? size > ours.size() : size != ours.size()) {
+    add_failure(name, "has " + std::to_string(ours.size()) + " values where the reference has " +
+                          std::to_string(size));
+    return {};
+  }
+  std::vector<float> expected(size);
+  file_.read_into(name, expected);
+  return expected;
+}
+
+void Comparison::compare_within(const std::string& name, std::span<const float> values,
+                                double tolerance) {
+  const std::vector<float> expected = take(name, values, false);
+  if (!expected.empty()) judge(name, values, expected, tolerance);
+}
+
+void Comparison::compare_l2(const std::string& name, std::span<const float> values,
+                            double tolerance) {
+  const std::vector<float> expected = take(name, values, true);
+  if (!expected.empty())
+    judge(name, values.first(expected.size()), expected, tolerance, Measure::kL2);
+}
+
+void Comparison::compare_steps(const std::string& name, std::span<const float> values,
+                               std::span<const double> tolerances) {
+  const std::vector<float> expected = take(name, values, false);
+  if (expected.empty()) return;
+  Line line{name, 0, 0, 0, Verdict::kOk, {}, Measure::kMax};
+  for (std::size_t i = 0; i < expected.size(); ++i) {
+    const double error = std::abs(static_cast<double>(values[i]) - expected[i]);
+    const double relative = error / std::abs(expected[i]);
+    line.max_abs_err = std::max(line.max_abs_err, error);
+    line.rel_err = std::max(line.rel_err, relative);
+    if (relative <= tolerances[i]) continue;
+    line.verdict = Verdict::kFail;
+    line.note = "step " + std::to_string(i + 1) + " is beyond its limit";
+  }
+  ok_ = ok_ && line.verdict == Verdict::kOk;
+  lines_.push_back(std::move(line));
+}
+
+void Comparison::compare_moved(const std::string& name, std::span<const float> values,
+                               std::span<const float> before, double tolerance) {
+  std::vector<float> expected = take(name, values, true);
+  if (expected.empty()) return;
+  std::vector<float> moved(expected.size());
+  for (std::size_t i = 0; i < expected.size(); ++i) {
+    moved[i] = values[i] - before[i];
+    expected[i] -= before[i];
+  }
+  judge(name, moved, expected, tolerance, Measure::kL2);
+  moved_.insert(moved_.end(), moved.begin(), moved.end());
+  moved_expected_.insert(moved_expected_.end(), expected.begin(), expected.end());
+}
+
+void Comparison::end_moved(const std::string& name, double tolerance) {
+  if (!moved_.empty()) judge(name, moved_, moved_expected_, tolerance, Measure::kL2);
+  moved_.clear();
+  moved_expected_.clear();
 }
 
 void Comparison::compare(const std::string& name, const std::vector<std::int64_t>& values) {
@@ -88,7 +156,7 @@ void Comparison::compare(const std::string& name, const std::vector<std::int64_t
                           std::to_string(expected.size()));
     return;
   }
-  Line line{name, 0, 0, 0, Verdict::kOk, {}};
+  Line line{name, 0, 0, 0, Verdict::kOk, {}, Measure::kMax};
   double largest = 0;
   for (std::size_t i = 0; i < values.size(); ++i) {
     line.max_abs_err =
@@ -102,8 +170,8 @@ void Comparison::compare(const std::string& name, const std::vector<std::int64_t
 }
 
 void Comparison::judge(const std::string& name, std::span<const float> ours,
-                       std::span<const float> expected) {
-  Line line{name, 0, 0, 0, Verdict::kOk, {}};
+                       std::span<const float> expected, double tolerance, Measure measure) {
+  Line line{name, 0, 0, 0, Verdict::kOk, {}, Measure::kMax};
   double largest = 0, squared_error = 0, squared_norm = 0;
   for (std::size_t i = 0; i < ours.size(); ++i) {
     const double a = ours[i], b = expected[i];
@@ -118,26 +186,29 @@ void Comparison::judge(const std::string& name, std::span<const float> ours,
   }
   if (squared_error > 0) line.rel_l2 = std::sqrt(squared_error / squared_norm);
   if (line.max_abs_err > 0) line.rel_err = largest > 0 ? line.max_abs_err / largest : kInfinity;
-  if (!(line.rel_err <= tolerance_)) line.verdict = Verdict::kFail;
+  line.measure = measure;
+  const double error = measure == Measure::kL2 ? line.rel_l2 : line.rel_err;
+  if (!(error <= tolerance)) line.verdict = Verdict::kFail;
   ok_ = ok_ && line.verdict == Verdict::kOk;
   lines_.push_back(std::move(line));
 }
 
 void Comparison::add_failure(const std::string& name, const std::string& note) {
-  lines_.push_back({name, kInfinity, kInfinity, kInfinity, Verdict::kFail, note});
+  lines_.push_back({name, kInfinity, kInfinity, kInfinity, Verdict::kFail, note, Measure::kMax});
   ok_ = false;
 }
 
 void Comparison::skip(const std::string& name, const std::string& why) {
   if (!wants(name) || !seen_.insert(name).second) return;
-  lines_.push_back({name, 0, 0, 0, Verdict::kSkipped, why});
+  lines_.push_back({name, 0, 0, 0, Verdict::kSkipped, why, Measure::kMax});
 }
 
 void Comparison::finish() {
   for (const lvggt::TensorEntry& entry : file_.entries()) {
     const std::string& name = entry.name;
     if (seen_.contains(name) || name.starts_with("weight.") || name.ends_with(".noise")) continue;
-    lines_.push_back({name, 0, 0, 0, Verdict::kNotChecked, "nothing was computed for it"});
+    lines_.push_back(
+        {name, 0, 0, 0, Verdict::kNotChecked, "nothing was computed for it", Measure::kMax});
     ok_ = false;
   }
 }
@@ -150,7 +221,8 @@ std::string Comparison::text() const {
     std::string name = line.name;
     name.resize(width, ' ');
     char numbers[64];
-    std::snprintf(numbers, sizeof numbers, "%.3e  %.3e", line.max_abs_err, line.rel_err);
+    std::snprintf(numbers, sizeof numbers, "%.3e  %.3e", line.max_abs_err,
+                  line.measure == Measure::kL2 ? line.rel_l2 : line.rel_err);
     switch (line.verdict) {
       case Verdict::kOk:
         text += name + "  " + numbers + "  ok\n";

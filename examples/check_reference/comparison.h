@@ -32,6 +32,24 @@ class Comparison {
   }
   void compare(const std::string& name, const std::vector<std::int64_t>& values);
 
+  // The same with a limit of its own for rel_err.
+  void compare_within(const std::string& name, std::span<const float> values, double tolerance);
+
+  // The same by Euclidean norms, |ours - ref| / |ref| <= tolerance; the file's tensor may hold the
+  // first elements only.
+  void compare_l2(const std::string& name, std::span<const float> values, double tolerance);
+
+  // Numbers of a sequence of steps, each with a limit of its own for |ours - ref| / |ref|.
+  void compare_steps(const std::string& name, std::span<const float> values,
+                     std::span<const double> tolerances);
+
+  // How far parameters have moved from `before`, |moved - moved ref| / |moved ref| by Euclidean
+  // norms: each against `tolerance`; and, with end_moved(), all since the last end_moved()
+  // together.
+  void compare_moved(const std::string& name, std::span<const float> values,
+                     std::span<const float> before, double tolerance);
+  void end_moved(const std::string& name, double tolerance);
+
   // A tensor that needs no check: an input, a weight, a statement about the reference itself.
   void accept(const std::string& name) { seen_.insert(name); }
   // A tensor that is not computed, and why; it is listed, but fails nothing.
@@ -46,14 +64,18 @@ class Comparison {
 
  private:
   enum class Verdict { kOk, kFail, kNotChecked, kSkipped };
+  enum class Measure { kMax, kL2 };
   struct Line {
     std::string name;
     double max_abs_err = 0, rel_err = 0;
     double rel_l2 = 0;  // |ours - ref| / |ref|, Euclidean norms
     Verdict verdict = Verdict::kOk;
     std::string note;  // why it failed, when the numbers do not say
+    Measure measure = Measure::kMax;
   };
-  void judge(const std::string& name, std::span<const float> ours, std::span<const float> expected);
+  void judge(const std::string& name, std::span<const float> ours, std::span<const float> expected,
+             double tolerance, Measure measure = Measure::kMax);
+  std::vector<float> take(const std::string& name, std::span<const float> ours, bool prefix);
   void add_failure(const std::string& name, const std::string& note);
 
   const lvggt::Safetensors& file_;
@@ -62,6 +84,7 @@ class Comparison {
   std::set<std::string, std::less<>> seen_;
   std::vector<Line> lines_;
   bool ok_ = true;
+  std::vector<float> moved_, moved_expected_;  // since the last end_moved()
 };
 
 }  // namespace check_reference
