@@ -64,4 +64,3 @@ BENCHMARK_CAPTURE(scaled_dot_product_attention, bf16, Storage::kBf16)->Apply(fra
 BENCHMARK_CAPTURE(scaled_dot_product_attention, int8, Storage::kI8)->Apply(frames);
 
 }  // namespace
-

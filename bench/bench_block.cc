@@ -75,4 +75,3 @@ BENCHMARK_CAPTURE(block_forward, bf16, Storage::kBf16)->Apply(tokens);
 BENCHMARK_CAPTURE(block_forward, int8, Storage::kI8)->Apply(tokens);
 
 }  // namespace
-

@@ -140,4 +140,3 @@ BENCHMARK(bilinear_forward)
     ->Unit(benchmark::kMillisecond);
 
 }  // namespace
-

@@ -1,13 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 // Streamed frames by stage, at 294 x 518 pixels:
 //   weights_init --seed 3 published.safetensors
-//   bench_frame --weights=published.safetensors [--frames=4] [--threads=0]
+//   bench_frame --weights=published.safetensors [--frames=4] [--threads=0] [--simd=AVX2]
+//               [--weights-storage=f32|bf16|f16|int8] [--cache-storage=f32|bf16|int8]
 #include <iostream>
 #include <string>
 #include <string_view>
 
 #include "bench/frame_flops.h"
 #include "bench/peak.h"
+#include "bench/simd_option.h"
 #include "lvggt/lvggt.h"
 
 namespace {
@@ -57,9 +59,15 @@ void run(int argc, char** argv) {
          "--weights=FILE is missing; weights_init --seed 3 FILE makes such a file");
   Context ctx(std::stoi(option(argc, argv, "threads", "0")));
   const std::int64_t num_frames = std::stoll(option(argc, argv, "frames", "4"));
-  const LangVggt model = LangVggt::load({.weights = weights}, ctx);
+  LoadOptions load{.weights = weights};
+  load.storage = StoragePolicy::of(
+      parse_storage(option(argc, argv, "weights-storage", "f32"), "--weights-storage"));
+  const LangVggt model = LangVggt::load(load, ctx);
   const Tensor<float, 4> frames = deterministic_images(3, num_frames, kHeight, kWidth);
-  Stream stream(model, ctx);
+  StreamOptions options;
+  options.cache_storage =
+      parse_storage(option(argc, argv, "cache-storage", "f32"), "--cache-storage");
+  Stream stream(model, ctx, options);
   const auto push = [&](benchmark::State& state) {
     push_frame(state, stream, model.config(), frames, ctx);
   };
@@ -74,6 +82,7 @@ void run(int argc, char** argv) {
 
 int main(int argc, char** argv) {
   try {
+    lvggt::bench::apply_simd_option(&argc, argv);
     run(argc, argv);
   } catch (const lvggt::Error& e) {
     std::cerr << "bench_frame: " << e.what() << '\n';

@@ -73,4 +73,3 @@ BENCHMARK_CAPTURE(linear_forward, int8, Storage::kI8)
     ->Unit(benchmark::kMillisecond);
 
 }  // namespace
-

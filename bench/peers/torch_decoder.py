@@ -96,11 +96,16 @@ class FeatureExtractor(nn.Module):
             setattr(self.scratch, f"refinenet{i + 1}", FusionBlock(features, i < 3))
         self.scratch.output_conv1 = nn.Conv2d(features, features, 3, padding=1)
 
+    def placed(self, x, size):
+        """x with what it should know of its place in the picture: nothing here."""
+        return x
+
     def forward(self, taps, h, w, size):
         layers = []
         for i, tokens in enumerate(taps):
             x = self.norm(tokens).transpose(1, 2).reshape(tokens.shape[0], -1, h, w)
-            layers.append(getattr(self.scratch, f"layer{i + 1}_rn")(self.resize_layers[i](self.projects[i](x))))
+            x = self.placed(self.projects[i](x), size)
+            layers.append(getattr(self.scratch, f"layer{i + 1}_rn")(self.resize_layers[i](x)))
         x = layers[3]
         for i in (3, 2, 1, 0):
             to = layers[i - 1].shape[2:] if i else [2 * s for s in layers[0].shape[2:]]
