@@ -46,22 +46,26 @@ void conv2d_forward(View<float, 4> y, View<const float, 4> x, const PackedConv2d
               "conv2d: residual is ", epilogue.residual.shape(), " but y is ", y.shape());
 
   Arena::Scope scope(ctx.arena());
-  const View<float, 1> zeros = ctx.arena().alloc(Shape{Cin});
-  std::fill_n(zeros.data(), Cin, 0.0f);
-  // Without padding, the taps of one kernel row lie side by side and are read as one.
-  const bool merged = w.padding == 0 && (w.kernel == 1 || x.stride(2) == Cin);
+  // Longer windows than a block of the product would have to be copied.
+  const std::int64_t kernel = w.kernel, window = kernel * Cin;
+  const bool windows =
+      kernel > 1 && x.stride(2) == Cin && (w.padding == 0 || window <= kernels::kMostLines);
+  const View<float, 1> zeros = ctx.arena().alloc(Shape{window});
+  std::fill_n(zeros.data(), window, 0.0f);
+  const kernels::TapAxis axis{kernel, w.stride, -w.padding, 1};
+  kernels::TapGather gather(y, x, epilogue.residual, axis, axis, zeros.data());
+  if (windows) {
+    gather.use_windows(ctx.arena().alloc(
+        Shape{std::int64_t{ctx.num_threads()}, kernel, kernels::kChunkRows, window}));
+  }
   const kernels::Product product{B * expected[1] * expected[2],
                                  &w.matrix,
-                                 merged ? w.kernel : w.kernel * w.kernel,
-                                 merged ? w.kernel * Cin : Cin,
+                                 windows ? kernel : kernel * kernel,
+                                 windows ? window : Cin,
                                  epilogue.bias.data(),
                                  epilogue.activation,
                                  epilogue.gamma.data(),
                                  !epilogue.residual.empty()};
-  const kernels::TapAxis down{w.kernel, w.stride, -w.padding, 1};
-  kernels::TapAxis across = down;
-  if (merged) across.taps = 1;
-  const kernels::TapGather gather(y, x, epilogue.residual, down, across, zeros.data());
   kernels::run_product(product, gather, ctx);
 }
 

@@ -212,6 +212,7 @@ void run_product(const Product& product, FunctionRef<void(const RowTable&)> gath
         RowTable table;
         table.begin = rows.begin;
         table.count = rows.end - rows.begin;
+        table.worker = worker;
         table.capacity = kChunkRows;
         table.x = x_rows[worker].data();
         table.y = y_rows[worker].data();

@@ -27,6 +27,7 @@ inline constexpr std::int64_t kSumPitch = kChunkPanels * kPanelWidth + 16;
 struct RowTable {
   std::int64_t begin = 0;
   std::int64_t count = 0;
+  int worker = 0;                    // whose scratch may hold copied inputs
   std::int64_t capacity = 0;         // distance between the inputs of two taps
   const float** x = nullptr;         // [taps, capacity]
   float** y = nullptr;               // [capacity]

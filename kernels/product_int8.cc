@@ -218,6 +218,7 @@ void run_product_int8(const Product& product, View<const float, 2> x,
         RowTable table;
         table.begin = rows.begin;
         table.count = rows.end - rows.begin;
+        table.worker = worker;
         table.capacity = kChunkRows;
         table.x = x_rows[worker].data();
         table.y = y_rows[worker].data();

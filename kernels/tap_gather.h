@@ -20,12 +20,24 @@ struct TapAxis {
 
 // Fills a product's row table for a convolution. Taps are in row-major order, output pixels in the
 // order of y; where a tap lies beyond x it reads `zeros`.
+//
+// Windows: the taps of one kernel row are neighbouring pixels, so that for dense pixels they can be
+// read as one, with fewer addresses and longer runs. The windows that cross a border are copied,
+// with zeros beyond it.
 class TapGather {
  public:
   // y, residual: [B, Ho, Wo, .], residual may be empty   x: [B, H, W, C]   zeros: [C]
   TapGather(View<float, 4> y, View<const float, 4> x, View<const float, 4> residual,
             const TapAxis& down, const TapAxis& across, const float* zeros)
       : y_(y), x_(x), residual_(residual), down_(down), across_(across), zeros_(zeros) {}
+
+  // Reads the taps of a kernel row as one window.   windows: [workers, taps down, kChunkRows, taps
+  // across * C], scratch for the copies   zeros: [taps across * C]
+  void use_windows(View<float, 4> windows) {
+    window_ = across_.taps;
+    across_.taps = 1;
+    windows_ = windows;
+  }
 
   void operator()(const RowTable& table) const {
     const std::int64_t Ho = y_.extent(1), Wo = y_.extent(2);
@@ -44,7 +56,11 @@ class TapGather {
       for (std::int64_t t = 0; t < down_.taps; ++t) {
         const std::int64_t iy = oy * down_.stride + down_.offset + t * down_.step;
         const float** to = table.x + t * across_.taps * table.capacity + r;
-        gather_run(to, table.capacity, b, iy, ox, run);
+        if (window_ > 1) {
+          gather_windows(to, windows_[table.worker][t].narrow(0, r, r + run), b, iy, ox);
+        } else {
+          gather_run(to, table.capacity, b, iy, ox, run);
+        }
       }
       r += run;
       ox = 0;
@@ -71,11 +87,37 @@ class TapGather {
     }
   }
 
+  // The windows of neighbouring output pixels; copies: [pixels, window * C]
+  void gather_windows(const float** to, View<float, 2> copies, std::int64_t b, std::int64_t iy,
+                      std::int64_t ox) const {
+    const std::int64_t run = copies.extent(0), W = x_.extent(2), C = x_.extent(3);
+    if (iy < 0 || iy >= x_.extent(1)) {
+      std::fill_n(to, run, zeros_);
+      return;
+    }
+    const float* row = x_.data() + b * x_.stride(0) + iy * x_.stride(1);
+    std::int64_t ix = ox * across_.stride + across_.offset;
+    for (std::int64_t i = 0; i < run; ++i, ix += across_.stride) {
+      if (ix >= 0 && ix + window_ <= W) {
+        to[i] = row + ix * C;
+        continue;
+      }
+      float* copy = copies[i].data();
+      for (std::int64_t t = 0; t < window_; ++t) {
+        const bool inside = ix + t >= 0 && ix + t < W;
+        std::copy_n(inside ? row + (ix + t) * C : zeros_, C, copy + t * C);
+      }
+      to[i] = copy;
+    }
+  }
+
   View<float, 4> y_;
   View<const float, 4> x_;
   View<const float, 4> residual_;
   TapAxis down_, across_;
   const float* zeros_;
+  std::int64_t window_ = 1;
+  View<float, 4> windows_;
 };
 
 }  // namespace lvggt::kernels
