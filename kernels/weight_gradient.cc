@@ -10,7 +10,7 @@
 
 #include "kernels/grain.h"
 #include "kernels/math-inl.h"
-#include "kernels/tile-inl.h"
+#include "kernels/outer_tile-inl.h"
 #include "kernels/weight_gradient_plan.h"
 #include "lvggt/core/parallel.h"
 
@@ -35,66 +35,16 @@ HWY_BEFORE_NAMESPACE();
 namespace lvggt::kernels::HWY_NAMESPACE {
 namespace {
 
-// sums[r][n] += sum over rows i and columns j of x[i][j][r] dy[i][j][n], for r < kTileRows and n <
-// 16 kPanels: the tile of every product (see tile-inl.h), with both operands advancing along the
-// summed axis.
-template <int kPanels>
-HWY_NOINLINE void outer_tile(const float* HWY_RESTRICT x, std::int64_t x_row,
-                             const float* HWY_RESTRICT dy, std::int64_t panel_stride,
-                             std::int64_t rows, std::int64_t columns, float* HWY_RESTRICT sums,
-                             std::int64_t sums_stride) {
-  constexpr int kVectors = kPanels * kPanelVectors;
-  const Floats d;
-  hn::Vec<Floats> sum[kTileRows][kVectors];
-#pragma GCC unroll 8
-  for (int r = 0; r < kTileRows; ++r) {
-#pragma GCC unroll 8
-    for (int v = 0; v < kVectors; ++v)
-      sum[r][v] = hn::LoadU(d, sums + r * sums_stride + v * kLanes);
-  }
-  for (std::int64_t i = 0; i < rows; ++i) {
-    const float* HWY_RESTRICT a = x + i * x_row;
-#pragma GCC unroll 1
-    for (std::int64_t j = 0; j < columns; ++j, a += kTileRows, dy += kPanelWidth) {
-      hn::Vec<Floats> b[kVectors];
-#pragma GCC unroll 8
-      for (int v = 0; v < kVectors; ++v) {
-        b[v] = hn::LoadU(d, dy + (v / kPanelVectors) * panel_stride + (v % kPanelVectors) * kLanes);
-      }
-#pragma GCC unroll 8
-      for (int r = 0; r < kTileRows; ++r) {
-        const auto value = hn::Set(d, a[r]);
-#pragma GCC unroll 8
-        for (int v = 0; v < kVectors; ++v) sum[r][v] = hn::MulAdd(value, b[v], sum[r][v]);
-      }
-    }
-  }
-#pragma GCC unroll 8
-  for (int r = 0; r < kTileRows; ++r) {
-#pragma GCC unroll 8
-    for (int v = 0; v < kVectors; ++v)
-      hn::StoreU(sum[r][v], d, sums + r * sums_stride + v * kLanes);
-  }
-}
-
-HWY_INLINE void outer_tile_of(std::int64_t panels, const float* x, std::int64_t x_row,
-                              const float* dy, std::int64_t panel_stride, std::int64_t rows,
-                              std::int64_t columns, float* sums, std::int64_t sums_stride) {
-  if constexpr (kTilePanels >= 3) {
-    if (panels == 3)
-      return outer_tile<3>(x, x_row, dy, panel_stride, rows, columns, sums, sums_stride);
-    if (panels == 2)
-      return outer_tile<2>(x, x_row, dy, panel_stride, rows, columns, sums, sums_stride);
-  }
-  outer_tile<1>(x, x_row, dy, panel_stride, rows, columns, sums, sums_stride);
-}
-
-// Copies the first `count` of `width` values, and zeros for the others.
+// Copies kWidth values, those beyond the first `count` as zeros.
+template <int kWidth>
 HWY_INLINE void copy_padded(float* HWY_RESTRICT to, const float* HWY_RESTRICT from,
-                            std::int64_t count, std::int64_t width) {
-  const Floats d;
-  for (std::int64_t i = 0; i < width; i += kLanes)
-    store_first(load_first(d, from + i, count - i), d, to + i, width - i);
+                            std::int64_t count) {
+  if (HWY_LIKELY(count >= kWidth)) {
+    for_each_vector(kWidth, [=](auto d, std::int64_t i)
+                                HWY_ATTR { hn::StoreU(hn::LoadU(d, from + i), d, to + i); });
+  } else {
+    for (std::int64_t i = 0; i < kWidth; ++i) to[i] = i < count ? from[i] : 0.0f;
+  }
 }
 
 // A rectangle of dy.
@@ -115,8 +65,8 @@ void copy_dy(const WeightGradientPlan& plan, View<const float, 4> dy, const Rect
                         rectangle.columns.begin * dy.stride(2) + first;
     for (std::int64_t j = 0; j < rectangle.columns.size(); ++j, from += dy.stride(2)) {
       for (std::int64_t p = 0; p < task.panels.size(); ++p)
-        copy_padded(to + p * pixels * kPanelWidth, from + p * kPanelWidth, count - p * kPanelWidth,
-                    kPanelWidth);
+        copy_padded<kPanelWidth>(to + p * pixels * kPanelWidth, from + p * kPanelWidth,
+                                 count - p * kPanelWidth);
       to += kPanelWidth;
     }
   }
@@ -156,20 +106,24 @@ void copy_x(const WeightGradientPlan& plan, View<const float, 4> x, const Rectan
       float* to =
           task.x + ((i * plan.stride + j % plan.stride) * columns + j / plan.stride) * kTileRows;
       for (std::int64_t g = 0; g < task.groups.size(); ++g)
-        copy_padded(to + g * group_step, from + g * kTileRows, inside ? count - g * kTileRows : 0,
-                    kTileRows);
+        copy_padded<kTileRows>(to + g * group_step, from + g * kTileRows,
+                               inside ? count - g * kTileRows : 0);
     }
   }
 }
 
 void add_rectangle(const WeightGradientPlan& plan, const Rectangle& rectangle,
-                   const WeightGradientTask& task) {
+                   const WeightGradientTask& task, NextRectangle next) {
   const std::int64_t height = rectangle.rows.size(), width = rectangle.columns.size();
   const std::int64_t columns = plan.x_columns(width);
   const std::int64_t x_row = plan.stride * columns * kTileRows;
   const std::int64_t group_step = plan.x_rows(height) * x_row;
   const std::int64_t panel_step = height * width * kPanelWidth;
   const std::int64_t sums_stride = task.panels.size() * kPanelWidth;
+  const std::int64_t shares =
+      ceil_div(task.panels.size(), kTilePanels) * task.groups.size() * plan.taps() * height;
+  next.dy_lines = ceil_div(next.dy.lines(), shares);
+  next.x_lines = ceil_div(next.x.lines(), shares);
   for_panel_groups(task.panels.size(), [&](std::int64_t panel, std::int64_t count) HWY_ATTR {
     for (std::int64_t g = 0; g < task.groups.size(); ++g) {
       for (std::int64_t t = 0; t < plan.taps(); ++t) {
@@ -179,21 +133,32 @@ void add_rectangle(const WeightGradientPlan& plan, const Rectangle& rectangle,
         float* sums = task.sums + (t * task.groups.size() + g) * kTileRows * sums_stride +
                       panel * kPanelWidth;
         outer_tile_of(count, x, plan.stride * x_row, task.dy + panel * panel_step, panel_step,
-                      height, width, sums, sums_stride);
+                      height, width, sums, sums_stride, next);
       }
     }
   });
 }
 
+Rectangle rectangle_at(const WeightGradientPlan& plan, std::int64_t n) {
+  return {n / plan.across / plan.down, part_of(plan.dy[1], n / plan.across % plan.down, plan.down),
+          part_of(plan.dy[2], n % plan.across, plan.across)};
+}
+
 void run_weight_gradient(const WeightGradientPlan& plan, View<const float, 4> dy,
                          View<const float, 4> x, const WeightGradientTask& task) {
   for (std::int64_t n = task.rectangles.begin; n < task.rectangles.end; ++n) {
-    const Rectangle rectangle{n / plan.across / plan.down,
-                              part_of(plan.dy[1], n / plan.across % plan.down, plan.down),
-                              part_of(plan.dy[2], n % plan.across, plan.across)};
+    const Rectangle rectangle = rectangle_at(plan, n);
     copy_dy(plan, dy, rectangle, task);
     copy_x(plan, x, rectangle, task);
-    add_rectangle(plan, rectangle, task);
+    NextRectangle next;
+    if (n + 1 < task.rectangles.end) {
+      const Rectangle after = rectangle_at(plan, n + 1);
+      next.dy = Fetch(dy, after.b, after.rows, after.columns, task.panels.begin * kPanelWidth,
+                      task.panels.size() * kPanelWidth);
+      next.x = Fetch(x, after.b, plan.inputs_of(after.rows), plan.inputs_of(after.columns),
+                     task.groups.begin * kTileRows, task.groups.size() * kTileRows);
+    }
+    add_rectangle(plan, rectangle, task, next);
   }
 }
 
@@ -235,31 +200,35 @@ TaskIndex task_index(const WeightGradientPlan& plan, std::int64_t task) {
           task / plan.output_blocks % plan.input_blocks, task % plan.output_blocks};
 }
 
-// dweight += the shares' sums, in order, for one panel of output and one group of input channels:
-// what is read and written then fits a first-level cache, although one runs along co and the other
-// along t.
+// dweight += the shares' sums, in order, for one panel of output and one group of input channels.
+// They are added up in `total`, [taps, tile_rows, 16], in the order in which they lie in memory;
+// its transposition into dweight stays in a first-level cache.
 void add_shares(const WeightGradientPlan& plan, View<float, 4> dweight, View<const float, 2> sums,
-                std::int64_t panel, std::int64_t group) {
+                std::int64_t panel, std::int64_t group, float* total) {
   const std::int64_t i = part_with(plan.input_groups, group, plan.input_blocks);
   const std::int64_t o = part_with(plan.output_panels, panel, plan.output_blocks);
   const Range groups = part_of(plan.input_groups, i, plan.input_blocks);
   const Range panels = part_of(plan.output_panels, o, plan.output_blocks);
   const std::int64_t width = panels.size() * kPanelWidth;
+  std::fill_n(total, plan.total_floats(), 0.0f);
+  for (std::int64_t s = 0; s < plan.shares; ++s) {
+    const float* share = sums[(s * plan.input_blocks + i) * plan.output_blocks + o].data() +
+                         (group - groups.begin) * plan.tile_rows * width +
+                         (panel - panels.begin) * kPanelWidth;
+    float* to = total;
+    for (std::int64_t t = 0; t < plan.taps(); ++t)
+      for (std::int64_t r = 0; r < plan.tile_rows; ++r, to += kPanelWidth) {
+        const float* line = share + (t * groups.size() * plan.tile_rows + r) * width;
+        for (std::int64_t n = 0; n < kPanelWidth; ++n) to[n] += line[n];
+      }
+  }
   const std::int64_t ci_end = std::min(plan.x[3], (group + 1) * plan.tile_rows);
   const std::int64_t co_end = std::min(plan.dy[3], (panel + 1) * kPanelWidth);
-  for (std::int64_t co = panel * kPanelWidth; co < co_end; ++co) {
-    for (std::int64_t ci = group * plan.tile_rows; ci < ci_end; ++ci) {
-      for (std::int64_t t = 0; t < plan.taps(); ++t) {
-        const std::int64_t row =
-            t * groups.size() * plan.tile_rows + ci - groups.begin * plan.tile_rows;
-        const std::int64_t at = row * width + co - panels.begin * kPanelWidth;
-        float sum = 0;
-        for (std::int64_t s = 0; s < plan.shares; ++s)
-          sum += sums[(s * plan.input_blocks + i) * plan.output_blocks + o][at];
-        dweight(co, ci, t / plan.kernel, t % plan.kernel) += sum;
-      }
-    }
-  }
+  for (std::int64_t co = panel * kPanelWidth; co < co_end; ++co)
+    for (std::int64_t ci = group * plan.tile_rows; ci < ci_end; ++ci)
+      for (std::int64_t t = 0; t < plan.taps(); ++t)
+        dweight(co, ci, t / plan.kernel, t % plan.kernel) +=
+            total[(t * plan.tile_rows + ci % plan.tile_rows) * kPanelWidth + co % kPanelWidth];
 }
 
 // dbias += the shares' sums, in order.
@@ -278,10 +247,38 @@ void add_bias_shares(const WeightGradientPlan& plan, View<float, 1> dbias,
 
 }  // namespace
 
+namespace {
+
+// With stride 1, dy and x may change places: with q = o + t - padding,
+//   dweight[co, ci, t] = sum over q of x[q, ci] dy[q + (k - 1 - t) - (k - 1 - padding), co]
+// is the weight gradient of a convolution from Cout to Cin channels, its taps turned by 180
+// degrees. For a handful of output channels that leaves fewer lanes of a tile idle: 3 of its 8 rows
+// are used instead of 3 of its 16 columns.
+void weight_gradient_exchanged(View<float, 4> dweight, View<const float, 4> dy,
+                               View<const float, 4> x, std::int64_t padding, Context& ctx) {
+  const std::int64_t Cout = dweight.extent(0), Cin = dweight.extent(1), k = dweight.extent(2);
+  Arena::Scope scope(ctx.arena());
+  const View<float, 4> turned = ctx.arena().alloc(Shape{Cin, Cout, k, k});
+  std::fill_n(turned.data(), turned.size(), 0.0f);
+  weight_gradient(turned, {}, x, dy, 1, k - 1 - padding, ctx);
+  for (std::int64_t co = 0; co < Cout; ++co)
+    for (std::int64_t ci = 0; ci < Cin; ++ci)
+      for (std::int64_t t = 0; t < k * k; ++t)
+        dweight(co, ci, t / k, t % k) += turned(ci, co, k - 1 - t / k, k - 1 - t % k);
+}
+
+}  // namespace
+
 void weight_gradient(View<float, 4> dweight, View<float, 1> dbias, View<const float, 4> dy,
                      View<const float, 4> x, std::int64_t stride, std::int64_t padding,
                      Context& ctx) {
   if (dy.size() == 0 || x.extent(3) == 0) return;
+  const bool few_outputs = dy.extent(3) <= kPanelWidth / 2 && x.extent(3) >= kPanelWidth;
+  if (few_outputs && stride == 1 && padding < dweight.extent(2)) {
+    weight_gradient_exchanged(dweight, dy, x, padding, ctx);
+    if (dbias) bias_gradient(dbias, dy, ctx);
+    return;
+  }
   const WeightGradientPlan plan(dy.shape(), x.shape(), dweight.extent(2), stride, padding,
                                 HWY_DYNAMIC_DISPATCH(tile_rows)());
   Arena::Scope scope(ctx.arena());
@@ -291,6 +288,7 @@ void weight_gradient(View<float, 4> dweight, View<float, 1> dbias, View<const fl
   const View<float, 2> sums = ctx.arena().alloc(Shape{plan.tasks(), plan.sum_floats()});
   const View<float, 2> bias_sums =
       ctx.arena().alloc(Shape{plan.shares * plan.output_blocks, plan.max_panels() * kPanelWidth});
+  const View<float, 2> totals = ctx.arena().alloc(Shape{workers, plan.total_floats()});
   const auto run = HWY_DYNAMIC_DISPATCH(run_weight_gradient);
   parallel_chunks(
       plan.tasks(),
@@ -312,8 +310,9 @@ void weight_gradient(View<float, 4> dweight, View<float, 1> dbias, View<const fl
       ctx);
   parallel_chunks(
       plan.output_panels * plan.input_groups,
-      [&](std::int64_t n, int) {
-        add_shares(plan, dweight, sums, n / plan.input_groups, n % plan.input_groups);
+      [&](std::int64_t n, int worker) {
+        add_shares(plan, dweight, sums, n / plan.input_groups, n % plan.input_groups,
+                   totals[worker].data());
       },
       ctx);
   if (dbias) add_bias_shares(plan, dbias, bias_sums);

@@ -32,20 +32,21 @@ constexpr std::int64_t part_with(std::int64_t count, std::int64_t i, std::int64_
 // side, then every tile of the result adds the rectangle's contribution in registers.
 //
 // Sizes. A copied value of x takes part in taps * 16 panels multiply-adds, one of dy in taps *
-// inputs: with about 288 / taps input channels and up to 9 panels, copying is 1 to 3 % of the work.
-// For a 3x3 kernel that makes, in floats,
-//   result  9 x 32 x 144      162 KiB
-//   dy      256 pixels x 144  144 KiB
-//   x       1.5 x 256 x 32     48 KiB
-// which stays in a second-level cache of 512 KiB.
+// inputs: with 576 / taps input channels and up to 9 panels, copying is 2 % of the instructions,
+// but more of the time, because it waits for memory. For a 3x3 kernel that makes, in floats,
+//   result  9 x 64 x 144      324 KiB, passed through once a rectangle
+//   dy      384 pixels x 144  216 KiB
+//   x       1.35 x 384 x 64   130 KiB
+// for the second-level cache, of which a tile reads 3 panels of dy (72 KiB) and 8 channels of x (16
+// KiB). Measured with 1 MiB: half the channels or half the pixels lose 3 to 8 % of the speed.
 struct WeightGradientPlan {
   static constexpr std::int64_t kBlockPanels = 9;
-  static constexpr std::int64_t kRowsPerTapSum = 288;
-  static constexpr std::int64_t kBlockPixels = 256;
+  static constexpr std::int64_t kRowsPerTapSum = 576;
+  static constexpr std::int64_t kBlockPixels = 384;
   static constexpr std::int64_t kBlockWidth = 64;
   // Tasks to balance dozens of threads; more shares of the pixels than needed for that would only
   // be more partial sums.
-  static constexpr std::int64_t kTasks = 96;
+  static constexpr std::int64_t kTasks = 64;
 
   Shape<4> dy, x;  // [B, Ho, Wo, Cout], [B, H, W, Cin]
   std::int64_t kernel = 0, stride = 0, padding = 0;
@@ -87,6 +88,11 @@ struct WeightGradientPlan {
   std::int64_t max_groups() const { return ceil_div(input_groups, input_blocks); }
   std::int64_t max_panels() const { return ceil_div(output_panels, output_blocks); }
 
+  // Rows (or columns) of x that rows (or columns) of dy read; some may lie beyond the border.
+  Range inputs_of(Range outputs) const {
+    return {outputs.begin * stride - padding, (outputs.end - 1) * stride - padding + kernel};
+  }
+
   // Pixels of x under a rectangle: rows one below the other; in a row, the columns of equal residue
   // modulo the stride lie side by side, so that one tap reads neighbours for neighbouring outputs.
   std::int64_t x_rows(std::int64_t height) const { return (height - 1) * stride + kernel; }
@@ -101,6 +107,7 @@ struct WeightGradientPlan {
   std::int64_t sum_floats() const {
     return taps() * max_groups() * tile_rows * max_panels() * kPanelWidth;
   }
+  std::int64_t total_floats() const { return taps() * tile_rows * kPanelWidth; }
 };
 
 }  // namespace lvggt::kernels

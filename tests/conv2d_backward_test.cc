@@ -131,6 +131,8 @@ TEST_CASE("conv2d_backward: maps that cross every block of pixels and of channel
   for_each_target([&] {
     check({3, 1, 1}, {1, 13, 131, 38, 20}, ctx);
     check({3, 1, 1}, {1, 3, 5, 20, 163}, ctx);
+    check({3, 1, 1}, {2, 9, 67, 33, 3}, ctx);
+    check({1, 1, 0}, {1, 9, 7, 70, 8}, ctx);
     check({3, 2, 1}, {2, 21, 37, 33, 20}, ctx);
     check({2, 2, 0}, {1, 37, 150, 10, 17}, ctx);
     check({1, 1, 0}, {1, 21, 37, 300, 50}, ctx);
