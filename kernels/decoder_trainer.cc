@@ -36,34 +36,44 @@ void validate(const TrainOptions& o, const ParameterStore& store) {
   usage(o.accumulate >= 1, "a batch cannot be processed in ", o.accumulate, " parts");
 }
 
-// Counts of a batch, summed over the ranks.
+// What a batch holds: labelled pixels of this rank's frames, and sums over all ranks.
 struct BatchCounts {
+  std::vector<std::int64_t> labelled;
   double frames = 0, labelled_pixels = 0, unlabelled_frames = 0;
 };
 
 BatchCounts count(const DecoderBatch& batch, Communicator& communicator, Context& ctx) {
   const auto [B, levels, H, W] = batch.mask.shape();
-  Arena::Scope scope(ctx.arena());
-  const View<std::int64_t, 1> labelled = ctx.arena().alloc<std::int64_t>(Shape{B});
+  BatchCounts counts;
+  counts.labelled.resize(static_cast<std::size_t>(B));
   parallel_chunks(
       B,
-      [&](std::int64_t b, int) {
+      [&, num_levels = levels, rows = H, columns = W](std::int64_t b, int) {
         std::int64_t pixels = 0;
-        for (std::int64_t l = 0; l < levels; ++l)
-          for (std::int64_t y = 0; y < H; ++y) {
+        for (std::int64_t l = 0; l < num_levels; ++l)
+          for (std::int64_t y = 0; y < rows; ++y) {
             const float* row = batch.mask[b][l][y].data();
-            pixels += std::count_if(row, row + W, [](float m) { return m > 0; });
+            pixels += std::count_if(row, row + columns, [](float m) { return m > 0; });
           }
-        labelled[b] = pixels;
+        counts.labelled[static_cast<std::size_t>(b)] = pixels;
       },
       ctx);
   std::array<double, 3> sums{static_cast<double>(B), 0, 0};
-  for (std::int64_t b = 0; b < B; ++b) {
-    sums[1] += static_cast<double>(labelled[b]);
-    sums[2] += labelled[b] == 0 ? 1 : 0;
+  for (const std::int64_t pixels : counts.labelled) {
+    sums[1] += static_cast<double>(pixels);
+    sums[2] += pixels == 0 ? 1 : 0;
   }
   communicator.sum(std::span<double>(sums));
-  return {sums[0], sums[1], sums[2]};
+  counts.frames = sums[0];
+  counts.labelled_pixels = sums[1];
+  counts.unlabelled_frames = sums[2];
+  return counts;
+}
+
+// The part of each frame of a batch in the means over all.
+FrameShares shares_of(const BatchCounts& counts) {
+  return {1 / counts.frames, 1 / std::max(1.0, counts.frames - counts.unlabelled_frames),
+          counts.labelled};
 }
 
 void check_batch(const DecoderBatch& batch, const ModelConfig& config) {
@@ -85,6 +95,16 @@ void check_batch(const DecoderBatch& batch, const ModelConfig& config) {
               batch.images.shape(), ", expected ", images);
   LVGGT_CHECK(config.sbd_head == DecoderHead::kMlp || batch.h * config.patch_size >= 8,
               "training: a UNet needs maps of at least 8 x 8 pixels");
+}
+
+void clear(std::span<float> values, Context& ctx) {
+  constexpr std::int64_t kGrain = std::int64_t{1} << 16;  // 256 KiB
+  parallel_rows(
+      std::ssize(values), kGrain,
+      [&](std::int64_t begin, std::int64_t end) {
+        std::fill_n(values.data() + begin, end - begin, 0.0f);
+      },
+      ctx);
 }
 
 // "the loss term cos is nan", or nothing.
@@ -139,7 +159,7 @@ DecoderTrainer::DecoderTrainer(ParameterStore& store, const TrainOptions& option
       Tensor<float, 1>(Shape{static_cast<std::int64_t>(store.block(StoreRole::kBuffers).size())});
 }
 
-LossTerms DecoderTrainer::run(const DecoderBatch& batch, double frames,
+LossTerms DecoderTrainer::run(const DecoderBatch& batch, const FrameShares& shares,
                               const DecoderOutputs& outputs, bool gradients,
                               const TapGradients& dtaps, StepTimes& times) {
   const ModelConfig& config = store_.config();
@@ -155,7 +175,7 @@ LossTerms DecoderTrainer::run(const DecoderBatch& batch, double frames,
   pass.bn_momentum = static_cast<float>(config.bn_momentum);
 
   std::ranges::copy(std::as_const(store_).block(StoreRole::kBuffers), running_.data());
-  if (gradients) std::ranges::fill(store_.block(StoreRole::kGradients), 0.0f);
+  if (gradients) clear(store_.block(StoreRole::kGradients), ctx_);
   LossTerms terms;
   const std::int64_t B = batch.num_frames(), parts = std::min(options_.accumulate, B);
   for (std::int64_t part = 0; part < parts; ++part) {
@@ -168,13 +188,16 @@ LossTerms DecoderTrainer::run(const DecoderBatch& batch, double frames,
       };
     TapGradients dpart;
     for (std::size_t i = 0; i < 4; ++i) dpart[i] = narrowed(dtaps[i]);
+    FrameShares part_shares = shares;
+    part_shares.labelled_pixels = shares.labelled_pixels.subspan(
+        static_cast<std::size_t>(begin), static_cast<std::size_t>(end - begin));
     const DecoderBatch frames_of_part = frames_of(batch, begin, end);
     const DecoderStep step{frames_of_part,
                            weights,
                            gradients ? &dweights : nullptr,
                            {narrowed(outputs.language), narrowed(outputs.rgb)},
                            objective_of(options_),
-                           static_cast<double>(end - begin) / frames,
+                           part_shares,
                            batch.h * config.patch_size,
                            batch.w * config.patch_size,
                            static_cast<float>(config.dpt_ln_eps)};
@@ -194,7 +217,8 @@ LossTerms DecoderTrainer::evaluate(const DecoderBatch& batch, const DecoderOutpu
                                    bool gradients, const TapGradients& dtaps) {
   check_batch(batch, store_.config());
   StepTimes times;
-  return run(batch, count(batch, communicator_, ctx_).frames, outputs, gradients, dtaps, times);
+  const BatchCounts counts = count(batch, communicator_, ctx_);
+  return run(batch, shares_of(counts), outputs, gradients, dtaps, times);
 }
 
 StepReport DecoderTrainer::step(const DecoderBatch& batch) {
@@ -204,7 +228,7 @@ StepReport DecoderTrainer::step(const DecoderBatch& batch) {
   report.labelled_pixels = static_cast<std::int64_t>(counts.labelled_pixels);
   report.frames_without_label = static_cast<std::int64_t>(counts.unlabelled_frames);
   report.learning_rate = learning_rate_at(options_.schedule, steps_);
-  report.loss = run(batch, counts.frames, {}, true, {}, report.times);
+  report.loss = run(batch, shares_of(counts), {}, true, {}, report.times);
 
   const TimeInto time(report.times.optimiser);
   report.grad_norm = gradient_norm(store_, ctx_);

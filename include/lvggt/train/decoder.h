@@ -23,7 +23,7 @@ struct DecoderStep {
   const DecoderParameters<float>* gradients;  // null: losses and outputs only
   DecoderOutputs outputs;
   Objective objective;
-  double share = 1;           // of these frames in the means over the whole batch
+  FrameShares shares;
   std::int64_t H = 0, W = 0;  // of the features: patch_size times the patch grid
   float ln_eps = 0;
 };
@@ -102,7 +102,7 @@ inline void branches_step(SummedGradient& dfeatures, LossTerms& terms,
                           const std::vector<std::string>& level_names, TrainingPass& pass) {
   const DecoderBatch& batch = step.batch;
   const std::int64_t Ho = batch.height(), Wo = batch.width();
-  const double level_share = step.share / static_cast<double>(batch.features.extent(1));
+  const std::int64_t levels = batch.features.extent(1);
   branch_step(
       dfeatures, terms, features, step.parameters.language,
       step.gradients ? &step.gradients->language : nullptr, Activation::kNone,
@@ -110,7 +110,7 @@ inline void branches_step(SummedGradient& dfeatures, LossTerms& terms,
       [&](View<float, 4> dy, LossTerms& sum, View<const float, 4> y, std::size_t i) {
         const auto level = static_cast<std::int64_t>(i);
         language_loss(dy, sum, y, level_of(batch.features, level), level_of(batch.mask, level),
-                      level_share, step.objective, pass.ctx);
+                      step.shares, levels, step.objective, pass.ctx);
         if (step.outputs.language) copy_frames(level_of(step.outputs.language, level), y, pass.ctx);
       },
       pass);
@@ -120,7 +120,7 @@ inline void branches_step(SummedGradient& dfeatures, LossTerms& terms,
       step.gradients ? &*step.gradients->rgb : nullptr, Activation::kSigmoid, 3, Ho, Wo,
       "rgb_encoder", {"rgb_decoder.0"},
       [&](View<float, 4> dy, LossTerms& sum, View<const float, 4> y, std::size_t) {
-        rgb_loss(dy, sum, y, batch.images, step.share, step.objective, pass.ctx);
+        rgb_loss(dy, sum, y, batch.images, step.shares, step.objective, pass.ctx);
         copy_frames(step.outputs.rgb, y, pass.ctx);
       },
       pass);

@@ -38,6 +38,8 @@ struct StepReport {
   std::optional<std::string> refused;
 };
 
+struct FrameShares;
+
 // Trains the decoder: forward, losses, backward, clipping, AdamW, moving average. Deterministic:
 // the same store and batches give the same bits for any number of threads.
 class DecoderTrainer {
@@ -70,7 +72,7 @@ class DecoderTrainer {
   const TrainOptions& options() const { return options_; }
 
  private:
-  LossTerms run(const DecoderBatch& batch, double frames, const DecoderOutputs& outputs,
+  LossTerms run(const DecoderBatch& batch, const FrameShares& shares, const DecoderOutputs& outputs,
                 bool gradients, const std::array<View<float, 3>, 4>& dtaps, StepTimes& times);
 
   ParameterStore& store_;

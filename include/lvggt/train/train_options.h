@@ -17,8 +17,8 @@ struct LossWeights {
 };
 
 // Values of the terms, unweighted, and their weighted sum. Means are over all elements, holes
-// included: a hole's cosine is 0, so a frame without any label adds nothing that depends on the
-// decoder's language output.
+// included (a hole's cosine is 0), of all frames; those of the language terms leave out frames
+// without any labelled pixel.
 struct LossTerms {
   double l1 = 0, cos = 0, img_l1 = 0, img_l2 = 0;
   double total = 0;
