@@ -96,6 +96,36 @@ double output_floats(const Frame& f, const ModelConfig& c, const StreamOptions& 
   return floats;
 }
 
+Frame frame_of(const ModelConfig& c, std::int64_t H, std::int64_t W) {
+  LVGGT_CHECK(H > 0 && W > 0 && H <= kMaxSide && W <= kMaxSide, "plan_memory: a frame of ", W,
+              " x ", H, " pixels does not lie in [1, ", kMaxSide, "]");
+  const std::int64_t patches = (H / c.patch_size) * (W / c.patch_size);
+  return {static_cast<double>(H * W), static_cast<double>(patches),
+          static_cast<double>(c.patch_start_idx() + patches), static_cast<double>(c.embed_dim)};
+}
+
+// Cached keys and values of a frame's tokens in all global blocks.
+double token_cache_per_frame(const Frame& f, const ModelConfig& c, const StreamOptions& options) {
+  return static_cast<double>(c.agg_depth) *
+         group_size(c.agg_heads, static_cast<std::int64_t>(f.tokens), c.embed_dim / c.agg_heads,
+                    options.cache_storage);
+}
+
+double encoder_scratch(const Frame& f, const ModelConfig& c) {
+  return 2 * f.tokens * f.C +
+         std::max(block_scratch(f, c.dino_heads, c), block_scratch(f, c.agg_heads, c));
+}
+
+// Counts floats like everything here, but the plan is in bytes.
+MemoryPlan plan_of(double weights, double cache, double arenas) {
+  const auto bytes = [](double floats) {
+    return static_cast<std::size_t>(std::min(floats * sizeof(float), 0x1p62));
+  };
+  MemoryPlan plan{bytes(weights), bytes(cache), bytes(arenas), 0};
+  plan.total = plan.weights + plan.cache + plan.arenas;
+  return plan;
+}
+
 }  // namespace
 
 MemoryPlan plan_memory(const ModelConfig& c, std::int64_t H, std::int64_t W,
@@ -106,13 +136,7 @@ MemoryPlan plan_memory(const ModelConfig& c, std::int64_t H, std::int64_t W,
 
 MemoryPlan plan_memory(const ModelConfig& c, std::int64_t H, std::int64_t W,
                        const StreamOptions& options, StorageOf storage_of) {
-  LVGGT_CHECK(H > 0 && W > 0 && H <= kMaxSide && W <= kMaxSide, "plan_memory: a frame of ", W,
-              " x ", H, " pixels does not lie in [1, ", kMaxSide, "]");
-  const std::int64_t patches = (H / c.patch_size) * (W / c.patch_size);
-  const std::int64_t P = c.patch_start_idx() + patches;
-  const Frame f{static_cast<double>(H * W), static_cast<double>(patches), static_cast<double>(P),
-                static_cast<double>(c.embed_dim)};
-
+  const Frame f = frame_of(c, H, W);
   double weights = 0;
   for (const TensorSpec& spec : geometry_tensors(c))
     if (options.points || !spec.name.starts_with("point_head."))
@@ -120,29 +144,32 @@ MemoryPlan plan_memory(const ModelConfig& c, std::int64_t H, std::int64_t W,
   if (options.decoder)
     for (const TensorSpec& spec : decoder_tensors(c)) weights += packed_size(spec, storage_of);
 
-  double cache_per_frame =
-      static_cast<double>(c.agg_depth) *
-      group_size(c.agg_heads, P, c.embed_dim / c.agg_heads, options.cache_storage);
+  double cache_per_frame = token_cache_per_frame(f, c, options);
   if (options.camera_cache == CameraCache::kStream)
     cache_per_frame += static_cast<double>(c.cam_trunk_depth) *
                        group_size(c.cam_heads, c.cam_iterations, 2 * c.embed_dim / c.cam_heads);
   const double cache = cache_per_frame * static_cast<double>(options.max_past_frames + 1);
 
   const double taps = 8 * f.tokens * f.C;
-  const double aggregator = 2 * f.tokens * f.C + std::max(block_scratch(f, c.dino_heads, c),
-                                                          block_scratch(f, c.agg_heads, c));
+  const double aggregator = encoder_scratch(f, c);
   const double half = static_cast<double>(c.dpt_features / 2);
   const double dense = f.pixels * (2 + half) + dpt_scratch(f, c.dpt_features, c.dpt_features / 2);
   const double decoder = options.decoder ? decoder_scratch(f, c) : 0;
   const double arenas =
       taps + std::max({aggregator, dense, decoder}) + output_floats(f, c, options);
 
-  const auto bytes = [](double floats) {
-    return static_cast<std::size_t>(std::min(floats * sizeof(float), 0x1p62));
-  };
-  MemoryPlan plan{bytes(weights), bytes(cache), bytes(arenas), 0};
-  plan.total = plan.weights + plan.cache + plan.arenas;
-  return plan;
+  return plan_of(weights, cache, arenas);
+}
+
+MemoryPlan plan_token_memory(const ModelConfig& c, std::int64_t H, std::int64_t W,
+                             const StreamOptions& options, StorageOf storage_of) {
+  const Frame f = frame_of(c, H, W);
+  double weights = 0;
+  for (const TensorSpec& spec : geometry_tensors(c))
+    if (spec.name.starts_with("aggregator.")) weights += packed_size(spec, storage_of);
+  const double cache =
+      token_cache_per_frame(f, c, options) * static_cast<double>(options.max_past_frames + 1);
+  return plan_of(weights, cache, 8 * f.tokens * f.C + encoder_scratch(f, c));
 }
 
 }  // namespace lvggt

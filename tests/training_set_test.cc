@@ -291,6 +291,7 @@ TEST_CASE("training_set: several scenes, their tokens in one folder by name") {
   CHECK(set.samples(Part::kTrain)[4].scene == 1);
   options.tokens = root / "a";
   CHECK(open_set(options).says("tokens of one scene"));
+  options.tokens = root.path();
   options.scenes = {a.path(), a.path() + "/"};
   CHECK(open_set(options).says("twice"));
   options.scenes = {};

@@ -47,29 +47,53 @@ Safetensors open_tokens(const std::string& folder, const TokenFrame& frame,
   return file;
 }
 
-}  // namespace
+template <int R>
+std::string sha256_values(const Tensor<float, R>& values) {
+  return sha256(std::as_bytes(std::span(values.data(), static_cast<std::size_t>(values.size()))));
+}
 
-std::string encoder_sha256(const Checkpoint& checkpoint, Context& ctx) {
+// Of the tensors of the encoder that are used, by name.
+std::vector<TensorSpec> encoder_tensors(const ModelConfig& config) {
   std::vector<TensorSpec> specs;
-  for (TensorSpec& spec : geometry_tensors(checkpoint.config()))
+  for (TensorSpec& spec : geometry_tensors(config))
     if (spec.name.starts_with("aggregator.") && !known_unused_tensor(spec.name))
       specs.push_back(std::move(spec));
   std::sort(specs.begin(), specs.end(),
             [](const TensorSpec& a, const TensorSpec& b) { return a.name < b.name; });
+  return specs;
+}
+
+}  // namespace
+
+std::string encoder_sha256(const Checkpoint& checkpoint, Context& ctx) {
+  const std::vector<TensorSpec> specs = encoder_tensors(checkpoint.config());
   std::vector<std::string> sums(specs.size());
   parallel_chunks(
       static_cast<std::int64_t>(specs.size()),
       [&](std::int64_t chunk, int) {
         const auto i = static_cast<std::size_t>(chunk);
-        const Tensor<float, 1> values = checkpoint.read_as(specs[i].name, Shape{specs[i].volume()});
-        sums[i] = sha256(
-            std::as_bytes(std::span(values.data(), static_cast<std::size_t>(values.size()))));
+        // Matrices may be kept as integers and scales, which read<2>() widens.
+        sums[i] = specs[i].shape.size() == 2
+                      ? sha256_values(checkpoint.read<2>(specs[i].name))
+                      : sha256_values(checkpoint.read_as(specs[i].name, Shape{specs[i].volume()}));
       },
       ctx);
   std::string text;
   for (std::size_t i = 0; i < specs.size(); ++i)
     text += specs[i].name + " " + shape_text(specs[i].shape) + " " + sums[i] + "\n";
   return sha256(std::as_bytes(std::span(text.data(), text.size())));
+}
+
+std::string encoder_storage(const Checkpoint& checkpoint) {
+  std::map<std::string_view, int> counts;
+  for (const TensorSpec& spec : encoder_tensors(checkpoint.config()))
+    if (spec.shape.size() >= 2 && spec.name.ends_with(".weight"))
+      ++counts[storage_name(checkpoint.storage_of(spec.name))];
+  if (counts.size() == 1) return std::string(counts.begin()->first);
+  std::string text;
+  for (const auto& [name, count] : counts)
+    text += concat(text.empty() ? "" : ", ", count, " ", name);
+  return text;
 }
 
 void write_tokens(const std::string& folder, const TokenFrame& frame,
@@ -94,6 +118,14 @@ bool has_tokens(const std::string& folder, const TokenFrame& frame, const TokenM
     return false;  // cut short or of another run: it is written again
   }
   return true;
+}
+
+bool is_token_file(const std::string& path) {
+  try {
+    return Safetensors::open(path).metadata().count(kStreamKey) > 0;
+  } catch (const Error&) {
+    return false;
+  }
 }
 
 TokenCache TokenCache::open(const std::string& folder) {

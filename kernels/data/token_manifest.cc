@@ -74,7 +74,7 @@ std::vector<std::pair<std::string, std::string>> settings_list(const TokenSettin
           {"max_past_frames", std::to_string(s.max_past_frames)},
           {"keep_first_frame", std::string(yes_no(s.window.keep_first))},
           {"keep_every", std::to_string(s.window.keep_every)},
-          {"weights_storage", std::string(storage_name(s.weights_storage))},
+          {"weights_storage", s.weights_storage},
           {"cache_storage", std::string(storage_name(s.cache_storage))},
           {"storage", std::string(dtype_name(s.storage))}};
 }
@@ -133,7 +133,7 @@ TokenSettings read_settings(const Members& root) {
   s.max_past_frames = number_text("max_past_frames", 1, kMany);
   s.window.keep_first = m.yes("keep_first_frame");
   s.window.keep_every = number_text("keep_every", 0, kMany);
-  s.weights_storage = parse_storage(m.text("weights_storage"), m.place("weights_storage"));
+  s.weights_storage = m.text("weights_storage");
   s.cache_storage = parse_storage(m.text("cache_storage"), m.place("cache_storage"));
   const std::string storage = m.text("storage");
   if (storage != "BF16" && storage != "F32")
@@ -226,6 +226,7 @@ std::string to_json(const TokenManifest& manifest) {
   json.field("status", manifest.complete ? "complete" : "partial");
   json.field("weights", manifest.weights);
   json.field("source", manifest.source);
+  json.field("source_sha256", manifest.source_sha256);
   json.field("start", manifest.start);
   json.field("stride", manifest.stride);
   json.key("settings");
@@ -241,6 +242,7 @@ std::string to_json(const TokenManifest& manifest) {
   for (const TokenFrame& frame : manifest.frames) {
     json.begin_object();
     json.field("name", frame.name);
+    json.field("image", frame.image);
     json.field("source_index", frame.source_index);
     json.field("image_sha256", frame.image_sha256);
     json.field("stream_sha256", frame.stream_sha256);
@@ -262,6 +264,7 @@ TokenManifest read_token_manifest(const std::string& path) {
   manifest.complete = root.text("status") == "complete";
   manifest.weights = root.text("weights");
   manifest.source = root.text("source");
+  manifest.source_sha256 = root.text("source_sha256");
   manifest.start = root.number("start");
   manifest.stride = root.number("stride");
   manifest.settings = read_settings(root);
@@ -274,9 +277,10 @@ TokenManifest read_token_manifest(const std::string& path) {
   std::string stream;
   for (const Json& entry : root.at("frames").as_array(root.place("frames"))) {
     const Members m(entry, root.place("frames"));
-    TokenFrame frame{m.text("name"), m.number("source_index"), m.text("image_sha256"),
-                     m.text("stream_sha256")};
+    TokenFrame frame{m.text("name"), m.text("image"), m.number("source_index"),
+                     m.text("image_sha256"), m.text("stream_sha256")};
     check_name(frame.name, root.place("frames"));
+    if (!frame.image.empty()) check_name(frame.image, root.place("frames"));
     if (!names.insert(frame.name).second)
       fail(ErrorKind::kFormat, root.place("frames"), ": the frame ", json_quote(frame.name),
            " is there twice");

@@ -113,7 +113,8 @@ class TinyScene {
       const SceneFrame& frame = scene.frames()[i];
       const std::string image = sha256_file(frame.image);
       stream = next_stream_sha256(stream, manifest.settings, frame.name, image);
-      manifest.frames.push_back({frame.name, static_cast<std::int64_t>(i), image, stream});
+      manifest.frames.push_back(
+          {frame.name, frame.name + ".png", static_cast<std::int64_t>(i), image, stream});
       std::array<Tensor<float, 2>, 4> values;
       std::array<View<const float, 2>, 4> taps;
       for (std::size_t t = 0; t < 4; ++t) {

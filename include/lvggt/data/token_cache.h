@@ -36,13 +36,15 @@ struct TokenSettings {
   PreprocessOptions preprocess;
   std::int64_t max_past_frames = 128;
   WindowPolicy window = {};
-  Storage weights_storage = Storage::kF32, cache_storage = Storage::kF32;
+  std::string weights_storage = "f32";  // of the encoder in memory, see encoder_storage()
+  Storage cache_storage = Storage::kF32;
   Dtype storage = Dtype::kBF16;  // of the files: kBF16 or kF32
 };
 
 // One frame's entry.
 struct TokenFrame {
   std::string name;               // of the picture without its extension, or the number in a video
+  std::string image;              // file name of the picture; empty for a video
   std::int64_t source_index = 0;  // in the folder or video, counted from 0
   std::string image_sha256;       // of the picture's file, or of a video frame's pixels
   std::string stream_sha256;      // see next_stream_sha256
@@ -60,6 +62,7 @@ struct TokenManifest {
   TokenSettings settings;
   ImageTransform transform;            // of every frame
   std::string source;                  // folder or video, for people
+  std::string source_sha256;           // of a video's file; empty for a folder
   std::int64_t start = 0, stride = 1;  // which of its frames, see FrameSourceOptions
   std::vector<TokenFrame> frames;      // in the order of the stream
   bool complete = false;               // false: more frames follow once make_tokens is resumed
@@ -83,6 +86,9 @@ std::string token_difference(const TokenSettings& found, const TokenSettings& wa
 // file, with or without heads and decoder.
 std::string encoder_sha256(const Checkpoint& checkpoint, Context& ctx);
 
+// How the encoder's weights are kept in memory: "f32", or "40 bf16, 96 int8" where they differ.
+std::string encoder_storage(const Checkpoint& checkpoint);
+
 // Writes the tokens of one frame.   taps: four times [h*w, 2C]
 // Errors: kWrite.
 void write_tokens(const std::string& folder, const TokenFrame& frame,
@@ -90,6 +96,9 @@ void write_tokens(const std::string& folder, const TokenFrame& frame,
 
 // Whether NAME.safetensors in `folder` holds the tokens of this frame of this stream, complete.
 bool has_tokens(const std::string& folder, const TokenFrame& frame, const TokenManifest& manifest);
+
+// Whether the file is one that write_tokens() wrote, whatever it was made from.
+bool is_token_file(const std::string& path);
 
 // The tokens of a scene, opened for reading. Nothing is loaded and nothing mapped (see InputFile):
 // a frame's values are read from its file when asked for, so that a cache larger than memory takes

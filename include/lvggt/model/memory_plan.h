@@ -27,4 +27,9 @@ MemoryPlan plan_memory(const ModelConfig& config, std::int64_t H, std::int64_t W
                        const StreamOptions& options,
                        FunctionRef<Storage(const std::string& weight)> storage_of);
 
+// The same for a TokenStream, which is the encoder without heads and decoder.
+MemoryPlan plan_token_memory(const ModelConfig& config, std::int64_t H, std::int64_t W,
+                             const StreamOptions& options,
+                             FunctionRef<Storage(const std::string& weight)> storage_of);
+
 }  // namespace lvggt
