@@ -9,6 +9,7 @@
 
 #include "lvggt/cli/program.h"
 #include "lvggt/cli/threads.h"
+#include "lvggt/cli/work_list.h"
 #include "lvggt/field/run_writer.h"
 #include "lvggt/io/frame_source.h"
 #include "lvggt/io/preprocess.h"
@@ -20,6 +21,8 @@ struct LiftOptions {
   std::string video, out, summary, mode = "crop", camera_cache = "stream", point_colors = "input";
   std::string weights_storage = "stored", cache_storage = "f32";
   std::string sha256;  // of the weights file; empty: any
+  std::string list, shard_text;
+  lvggt::cli::ListOptions list_options;
   lvggt::LoadOptions weights;
   lvggt::FrameSourceOptions frames;
   lvggt::PreprocessOptions preprocess;
@@ -41,6 +44,13 @@ struct LiftOptions {
       fail(ErrorKind::kUsage, "--mode: gt is for training targets; use crop, pad or original");
     if (size % kPatchSize != 0)
       fail(ErrorKind::kUsage, "--size: ", size, " is not a multiple of ", kPatchSize);
+    if (video.empty() == list.empty())
+      fail(ErrorKind::kUsage, "VIDEO is required, or --list FILE instead of it");
+    if (!list.empty() && (force || dry_run || !summary.empty()))
+      fail(ErrorKind::kUsage, "--list goes with none of --force, --dry-run and --summary");
+    if (list.empty() && (!shard_text.empty() || list_options.retry_failed))
+      fail(ErrorKind::kUsage, "--shard and --retry-failed are for --list");
+    if (!shard_text.empty()) list_options.shard = cli::parse_shard(shard_text);
     if (force && resume) fail(ErrorKind::kUsage, "--force and --resume exclude each other");
     if (out.empty() && !dry_run)
       fail(ErrorKind::kUsage, "--out is required (except with --dry-run)");
@@ -105,7 +115,9 @@ namespace lift_options {
 
 inline void add_inputs(lvggt::cli::Program& program, LiftOptions& o) {
   CLI::App& app = program.app();
-  app.add_option("VIDEO", o.video, "A video, a folder of images, or an image")->required();
+  app.add_option("VIDEO", o.video, "A video, a folder of images, or an image");
+  app.add_option("--list", o.list, "A file that names many of them, one a line; see below")
+      ->type_name("FILE");
   app.add_option("--weights", o.weights.weights,
                  "The geometry model: safetensors, or a sharded model's index or folder")
       ->type_name("FILE")
@@ -185,12 +197,19 @@ inline void add_model(lvggt::cli::Program& program, LiftOptions& o) {
 
 inline void add_outputs(lvggt::cli::Program& program, LiftOptions& o) {
   CLI::App& app = program.app();
-  app.add_option("--out", o.out, "Folder for the results; its parent exists")->type_name("DIR");
+  app.add_option(
+         "--out", o.out,
+         "Folder for the results; its parent exists. With --list, it gets a folder for each")
+      ->type_name("DIR");
   app.add_flag("--force", o.force, "Replace an earlier run in that folder");
   app.add_flag(
       "--resume", o.resume,
       "Continue an interrupted run: files that are there stay. All frames are computed again, "
       "because each depends on those before");
+  app.add_option("--shard", o.shard_text, "With --list: take only every N-th input, from the I-th")
+      ->type_name("I/N");
+  app.add_flag("--retry-failed", o.list_options.retry_failed,
+               "With --list: also try what failed in earlier runs");
   app.add_flag("--dry-run", o.dry_run, "Print the plan (frames, sizes, memory) and stop");
   app.add_option("--summary", o.summary,
                  "Write a JSON summary: times by stage, peak memory; - for stdout")
@@ -227,9 +246,11 @@ inline void add_lift_options(lvggt::cli::Program& program, LiftOptions& options)
   lift_options::add_model(program, options);
   lift_options::add_outputs(program, options);
   program.app().footer(
-      "Exit status: 0 done, 1 failed at run time, 2 wrong usage, 3 bad input, 4 memory or a "
+      std::string(lvggt::cli::kListHelp) +
+      "\n\nExit status: 0 done, 1 failed at run time, 2 wrong usage, 3 bad input, 4 memory or a "
       "limit,\n"
-      "5 partial result (the video ends early), 130 interrupted.\n\n"
-      "Example:\n"
-      "  lift_video clip.mp4 --weights model.safetensors --decoder decoder.safetensors --out clip");
+      "5 partial result (the video ends early, or inputs of the list failed), 130 interrupted.\n\n"
+      "Examples:\n"
+      "  lift_video clip.mp4 --weights model.safetensors --decoder decoder.safetensors --out clip\n"
+      "  mpirun -n 4 lift_video --list videos.txt --weights model.safetensors --out lifted");
 }

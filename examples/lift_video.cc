@@ -197,14 +197,10 @@ int conclude(const LiftOptions& options, const Input& input, const Times& times,
   return record.status == "partial" ? kPartial : 0;
 }
 
-// Whether an earlier run with the same settings is complete, so that nothing is left to do.
-bool already_complete(const LiftOptions& options, const cli::RunRecord& record) {
-  if (!options.resume || !cli::check_output_folder(options.out, cli::Existing::kResume))
-    return false;
-  const std::string file = options.out + "/" + cli::kRunFile;
-  if (cli::check_same_settings(file, record) != "complete") return false;
-  say(options.out + ": the run is complete already");
-  return true;
+// How an earlier run with the same settings ended, if it may be continued; else empty.
+std::string earlier_status(const LiftOptions& options, const cli::RunRecord& record) {
+  if (!options.resume || !cli::check_output_folder(options.out, cli::Existing::kResume)) return {};
+  return cli::check_same_settings(options.out + "/" + cli::kRunFile, record);
 }
 
 cli::RunRecord make_record(const LiftOptions& options, const Input& input,
@@ -229,21 +225,56 @@ cli::RunRecord make_record(const LiftOptions& options, const Input& input,
   return record;
 }
 
-int lift(LiftOptions& options, int argc, char** argv) {
-  options.settle();
-  options.out = cli::without_trailing_slashes(options.out);
-  if (!options.dry_run)
-    cli::check_output_folder(options.out, options.resume  ? cli::Existing::kResume
-                                          : options.force ? cli::Existing::kReplace
-                                                          : cli::Existing::kRefuse);
-  if (!options.summary.empty() && options.summary != "-") check_output_file(options.summary, true);
-  const cli::ThreadChoice threads = cli::choose_threads(options.threads);
-  const cli::InterruptGuard interrupt;
+// What all videos of a list share: the weights are read once, when the first video needs them.
+class SharedModel {
+ public:
+  explicit SharedModel(const LiftOptions& options)
+      : options_(options),
+        threads_(cli::choose_threads(options.threads)),
+        checkpoint_(options.weights) {}
 
-  // Names and shapes only: what the run needs is known before anything large is read.
-  const Checkpoint checkpoint(options.weights);
-  options.preprocess.size =
-      options.size > 0 ? options.size : static_cast<int>(checkpoint.config().img_size);
+  const cli::ThreadChoice& threads() const { return threads_; }
+  // Names and shapes only: what a run needs is known before anything large is read.
+  const Checkpoint& checkpoint() const { return checkpoint_; }
+
+  Context& ctx() {
+    if (!ctx_) ctx_.emplace(threads_.threads);
+    return *ctx_;
+  }
+
+  // Adds the seconds that it took this time.
+  const LangVggt& get(double& seconds) {
+    if (model_) return *model_;
+    const StageTimer timer(seconds);
+    if (!checkpoint_.all_f32()) say(checkpoint_.storage_summary());
+    if (!options_.sha256.empty()) check_sha256(options_.weights.weights, options_.sha256);
+    model_.emplace(LangVggt::load(options_.weights, ctx()));
+    for (const std::string& warning : model_->warnings()) say("warning: " + warning);
+    if (!model_->has_decoder()) say("no decoder: geometry only, without semantics and RGB");
+    return *model_;
+  }
+
+ private:
+  const LiftOptions& options_;
+  cli::ThreadChoice threads_;
+  Checkpoint checkpoint_;
+  std::optional<Context> ctx_;
+  std::optional<LangVggt> model_;
+};
+
+void check_folder(const LiftOptions& options) {
+  if (options.dry_run) return;
+  cli::check_output_folder(options.out, options.resume  ? cli::Existing::kResume
+                                        : options.force ? cli::Existing::kReplace
+                                                        : cli::Existing::kRefuse);
+}
+
+// One video; returns the exit status. `done_before` is set when an earlier run left nothing to do.
+int lift_one(const LiftOptions& options, SharedModel& shared, const cli::InterruptGuard& interrupt,
+             bool& done_before, int argc, char** argv) {
+  check_folder(options);
+  const Checkpoint& checkpoint = shared.checkpoint();
+  const cli::ThreadChoice& threads = shared.threads();
   Input input = open_input(options);
   const Plan plan =
       plan_run(checkpoint, options, input.transform, reachable_past_frames(options, input));
@@ -253,24 +284,20 @@ int lift(LiftOptions& options, int argc, char** argv) {
 
   cli::RunRecord record = make_record(options, input, threads, argc, argv);
   record.planned_bytes = plan.total;
-  if (already_complete(options, record)) return 0;
+  const std::string earlier = earlier_status(options, record);
+  // A list is not run again for a video that ends early: it would end there again.
+  if (earlier == "complete" || (earlier == "partial" && !options.list.empty())) {
+    say(options.out + ": the run is " + earlier + " already");
+    done_before = true;
+    return earlier == "partial" ? kPartial : 0;
+  }
   say(concat(threads.threads, threads.threads == 1 ? " thread (" : " threads (", threads.reason,
              "), about ", cli::bytes_text(plan.total), " of memory"));
-  if (!checkpoint.all_f32()) say(checkpoint.storage_summary());
 
-  Context ctx(threads.threads);
   Times times;
-  std::optional<LangVggt> model;
-  {
-    const StageTimer timer(times.load);
-    if (!options.sha256.empty()) check_sha256(options.weights.weights, options.sha256);
-    model.emplace(LangVggt::load(options.weights, ctx));
-  }
-  record.warnings = model->warnings();
-  for (const std::string& warning : record.warnings) say("warning: " + warning);
-  if (!model->has_decoder()) say("no decoder: geometry only, without semantics and RGB");
-
-  Lift run(options, input, *model, record, times, interrupt, ctx);
+  const LangVggt& model = shared.get(times.load);
+  record.warnings = model.warnings();
+  Lift run(options, input, model, record, times, interrupt, shared.ctx());
   try {
     run.run();
   } catch (const std::exception& error) {
@@ -285,6 +312,45 @@ int lift(LiftOptions& options, int argc, char** argv) {
     throw;
   }
   return conclude(options, input, times, run.has_folder(), record);
+}
+
+// All videos of a list, or those that other processes leave to this one.
+int lift_list(const LiftOptions& options, SharedModel& shared, const cli::InterruptGuard& interrupt,
+              int argc, char** argv) {
+  const auto items = cli::read_work_list(
+      options.list,
+      [&](const std::string&, const std::string& name) { return options.out + "/" + name; });
+  std::error_code ignored;
+  if (!std::filesystem::is_directory(options.out, ignored)) cli::create_output_folder(options.out);
+  const auto work = [&](const cli::WorkItem& item) {
+    LiftOptions one = options;
+    one.video = item.input;
+    one.out = item.out;
+    one.resume = true;
+    bool done_before = false;
+    const int status = lift_one(one, shared, interrupt, done_before, argc, argv);
+    if (status == exit_code(ErrorKind::kInterrupted)) return cli::WorkResult::kInterrupted;
+    if (status == kPartial) return cli::WorkResult::kPartial;
+    return done_before ? cli::WorkResult::kAlreadyDone : cli::WorkResult::kDone;
+  };
+  return cli::WorkOff(items, options.list_options,
+                      {[&] { return interrupt.requested(); }, work, say})
+      .run();
+}
+
+int lift(LiftOptions& options, int argc, char** argv) {
+  options.settle();
+  options.out = cli::without_trailing_slashes(options.out);
+  if (!options.summary.empty() && options.summary != "-") check_output_file(options.summary, true);
+  // The output folder is looked at before the weights: it is the cheaper of the two.
+  if (options.list.empty()) check_folder(options);
+  const cli::InterruptGuard interrupt;
+  SharedModel shared(options);
+  options.preprocess.size =
+      options.size > 0 ? options.size : static_cast<int>(shared.checkpoint().config().img_size);
+  if (!options.list.empty()) return lift_list(options, shared, interrupt, argc, argv);
+  bool done_before = false;
+  return lift_one(options, shared, interrupt, done_before, argc, argv);
 }
 
 }  // namespace

@@ -216,6 +216,16 @@ int conclude(const Input& input, const std::string& out, std::int64_t num_kept,
   return record.status == "partial" ? kPartial : 0;
 }
 
+// Whether the record of a complete run says that its video ends before its announced end.
+bool ended_early(const std::string& out) {
+  const std::string file = out + "/" + cli::kRunFile;
+  std::error_code ignored;
+  if (!std::filesystem::exists(file, ignored)) return false;
+  const Json record = Json::read(file);
+  const Json* status = record.find("status");
+  return status != nullptr && status->is_string() && status->as_string(file) == "partial";
+}
+
 // What the folder may hold already.
 enum class Earlier { kRefuse, kReplace, kResume };
 
@@ -243,7 +253,7 @@ int make_tokens(const MakeTokensOptions& options, const std::string& path, const
     if (is_complete(out, before, manifest, input)) {
       say(out + ": the tokens are complete already");
       done_before = true;
-      return 0;
+      return ended_early(out) ? kPartial : 0;
     }
   }
   cli::RunRecord record = make_record(options, input, encoder, plan, argc, argv);

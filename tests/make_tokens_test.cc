@@ -11,8 +11,10 @@
 #include <thread>
 #include <vector>
 
+#include "lvggt/core/float16.h"
 #include "lvggt/data/training_set.h"
 #include "lvggt/io/hash.h"
+#include "lvggt/io/json.h"
 #include "lvggt/io/safetensors.h"
 #include "tests/support/child_process.h"
 #include "tests/support/files.h"

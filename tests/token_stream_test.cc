@@ -18,6 +18,7 @@ TEST_CASE("token_stream: its tokens are those that the heads of a stream read, t
   StreamOptions options;
   options.max_past_frames = 2;  // frames are evicted
   options.decoder = false;
+  options.allow_degenerate_camera = true;
   Stream stream(tiny.model, ctx, options);
   const StreamVggt& geometry = tiny.model.geometry();
   TokenStream tokens(geometry.aggregator, ctx, options);
