@@ -2,6 +2,8 @@
 #include "lvggt/kernels/conv2d.h"
 
 #include <algorithm>
+#include <numeric>
+#include <vector>
 
 #include "kernels/pack.h"
 #include "kernels/product.h"
@@ -26,6 +28,18 @@ PackedConv2d pack_conv2d(View<const float, 4> weight, std::int64_t stride, std::
     }
   }
   return packed;
+}
+
+PackedConv2d pack_conv2d(View<const float, 4> weight, std::int64_t stride, std::int64_t padding,
+                         Context& ctx) {
+  const auto [Cout, Cin, kernel, kernel_x] = weight.shape();
+  LVGGT_CHECK(kernel == kernel_x && weight.dense(), "conv2d: weight ", weight.shape(),
+              " does not have a square kernel, or has gaps");
+  const std::int64_t taps = kernel * kernel;
+  std::vector<std::int64_t> offsets(static_cast<std::size_t>(taps));
+  std::iota(offsets.begin(), offsets.end(), 0);
+  return {Cin, kernel, stride, padding,
+          kernels::pack_strided(weight.data(), Cout, Cin * taps, Cin, taps, offsets, ctx)};
 }
 
 void conv2d_forward(View<float, 4> y, View<const float, 4> x, const PackedConv2d& w,

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Backward passes of the three layers that are products: conv2d, conv_transpose2d, linear.
 #include <algorithm>
+#include <vector>
 
 #include "kernels/pack.h"
 #include "kernels/product.h"
@@ -44,7 +45,7 @@ class InputGradient {
     const Phase across = phase_of(phase_x, dx_.extent(2), kernel, stride_, padding_);
     const std::int64_t M = dx_.extent(0) * down.inputs * across.inputs;
     if (M == 0) return;
-    const PackedMatrix w = packed(down, across);
+    const PackedMatrix w = packed(down, across, ctx);
     const kernels::Product product{M, &w, w.taps, w.K, nullptr, Activation::kNone, nullptr, false};
     // Input p = phase + stride i reads, through its j-th tap, output i + first - j.
     const auto axis = [&](const Phase& p, std::int64_t phase) {
@@ -65,18 +66,17 @@ class InputGradient {
   }
 
   // The phase's taps, input and output channels exchanged.
-  PackedMatrix packed(const Phase& down, const Phase& across) const {
+  PackedMatrix packed(const Phase& down, const Phase& across, Context& ctx) const {
     const std::int64_t Cout = weight_.extent(0), Cin = weight_.extent(1);
     // Without a tap nothing reads these pixels: a tap of zero weights gives them gradient 0.
     const std::int64_t taps = std::max<std::int64_t>(1, down.taps * across.taps);
-    PackedMatrix matrix = kernels::empty_matrix(Cin, taps, Cout, Storage::kF32);
-    for (std::int64_t t = 0; t < down.taps * across.taps; ++t)
-      for (std::int64_t co = 0; co < Cout; ++co)
-        for (std::int64_t ci = 0; ci < Cin; ++ci)
-          kernels::set_weight(
-              matrix, ci, t * Cout + co,
-              weight_(co, ci, tap(down, t / across.taps), tap(across, t % across.taps)));
-    return matrix;
+    if (down.taps * across.taps == 0) return kernels::empty_matrix(Cin, taps, Cout, Storage::kF32);
+    std::vector<std::int64_t> offsets;
+    for (std::int64_t t = 0; t < taps; ++t)
+      offsets.push_back(tap(down, t / across.taps) * weight_.stride(2) +
+                        tap(across, t % across.taps));
+    return kernels::pack_strided(weight_.data(), Cin, weight_.stride(1), Cout, weight_.stride(0),
+                                 offsets, ctx);
   }
 
   View<float, 4> dx_;
@@ -162,7 +162,7 @@ void conv_transpose2d_backward(View<float, 4> dx, View<float, 4> dweight, View<f
   // this one, [Cout, Cin, k, k] of that convolution.
   if (dweight) kernels::weight_gradient(dweight, {}, x, dy, k, 0, ctx);
   if (dbias) kernels::bias_gradient(dbias, dy, ctx);
-  if (dx) conv2d_forward(dx, dy, pack_conv2d(weight, k, 0), {}, ctx);
+  if (dx) conv2d_forward(dx, dy, pack_conv2d(weight, k, 0, ctx), {}, ctx);
 }
 
 void linear_backward(View<float, 2> dx, View<float, 2> dweight, View<float, 1> dbias,

@@ -24,6 +24,18 @@ PackedConvTranspose2d pack_conv_transpose2d(View<const float, 4> weight, Storage
   return packed;
 }
 
+PackedConvTranspose2d pack_conv_transpose2d(View<const float, 4> weight, Context& ctx) {
+  const auto [Cin, Cout, kernel, kernel_x] = weight.shape();
+  LVGGT_CHECK(kernel == kernel_x && weight.dense(), "conv_transpose2d: weight ", weight.shape(),
+              " does not have a square kernel, or has gaps");
+  const std::int64_t places = kernel * kernel;
+  PackedConvTranspose2d packed{Cin, Cout, kernel, {}};
+  for (std::int64_t place = 0; place < places; ++place)
+    packed.places.push_back(
+        kernels::pack_strided(weight.data(), Cout, places, Cin, Cout * places, {&place, 1}, ctx));
+  return packed;
+}
+
 void conv_transpose2d_forward(View<float, 4> y, View<const float, 4> x,
                               const PackedConvTranspose2d& w, View<const float, 1> bias,
                               Context& ctx) {

@@ -2,6 +2,9 @@
 // Private: weights into panels.
 #pragma once
 
+#include <span>
+
+#include "lvggt/core/context.h"
 #include "lvggt/core/float16.h"
 #include "lvggt/kernels/packed_matrix.h"
 
@@ -28,5 +31,12 @@ inline void set_weight(PackedMatrix& matrix, std::int64_t n, std::int64_t line, 
       break;  // empty_matrix refuses it
   }
 }
+
+// A float32 matrix from weights in any order, on the threads of ctx: for training, where they
+// change with every step. Line t * K + k of output channel n is
+//   weight[n * n_stride + k * k_stride + tap_offsets[t]]
+PackedMatrix pack_strided(const float* weight, std::int64_t N, std::int64_t n_stride,
+                          std::int64_t K, std::int64_t k_stride,
+                          std::span<const std::int64_t> tap_offsets, Context& ctx);
 
 }  // namespace lvggt::kernels

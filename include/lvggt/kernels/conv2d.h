@@ -21,6 +21,10 @@ struct PackedConv2d {
 PackedConv2d pack_conv2d(View<const float, 4> weight, std::int64_t stride, std::int64_t padding,
                          Storage storage = Storage::kF32);
 
+// The same in float32 on the threads of ctx: for training, where weights change with every step.
+PackedConv2d pack_conv2d(View<const float, 4> weight, std::int64_t stride, std::int64_t padding,
+                         Context& ctx);
+
 // Extent of the output along one axis: floor((in + 2 padding - kernel) / stride) + 1.
 constexpr std::int64_t conv2d_extent(std::int64_t in, std::int64_t kernel, std::int64_t stride,
                                      std::int64_t padding) {

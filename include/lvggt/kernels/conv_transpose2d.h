@@ -21,6 +21,9 @@ struct PackedConvTranspose2d {
 PackedConvTranspose2d pack_conv_transpose2d(View<const float, 4> weight,
                                             Storage storage = Storage::kF32);
 
+// The same in float32 on the threads of ctx: for training, where weights change with every step.
+PackedConvTranspose2d pack_conv_transpose2d(View<const float, 4> weight, Context& ctx);
+
 // y[b, k*i + ky, k*j + kx, :] = sum over Cin of x[b, i, j, :] w[:, :, ky, kx] + bias, channels
 // last; pixels may be strided.
 //   y: [B, k*H, k*W, Cout]   x: [B, H, W, Cin]   bias: [Cout] or empty
