@@ -72,6 +72,7 @@ TEST_CASE("sample_loader: every sample comes once an epoch, with its own values"
   const Data data(6);
   SampleLoader loader(*data.set, options_of(2));
   CHECK(loader.batches_per_epoch() == 3);
+  CHECK(SampleLoader::count_batches(*data.set, options_of(2)) == 3);
   for (int epoch = 0; epoch < 3; ++epoch) {
     std::vector<int> seen(6);
     for (int i = 0; i < 3; ++i) {

@@ -5,6 +5,7 @@
 
 #include <cmath>
 
+#include "lvggt/data/scene.h"
 #include "tests/support/files.h"
 #include "tests/support/safetensors_bytes.h"
 #include "tests/support/tiny_scene.h"
@@ -223,4 +224,23 @@ TEST_CASE("paint_targets: shrinking takes the pixel in the middle, as the pictur
   const Targets result = paint(labels, kClip, t, 1, 2);
   CHECK(result.features(0, 0, 0, 0) == 2);
   CHECK(result.features(0, 0, 1, 0) == 5);
+}
+
+TEST_CASE("supervision: a real labelled frame is read as its makers describe it") {
+  const Scene scene = Scene::open(LVGGT_TEST_DATA "/golden/scene");
+  REQUIRE(scene.frames().size() == 1);
+  for (const SupervisionSpec& spec : {kClip, kDynamic}) {
+    const auto [rows, codes] = scene.label_files(scene.frames()[0], spec);
+    const FrameLabels labels = read_labels(rows, codes, spec);
+    CHECK(labels.rows.shape() == (Shape{spec.levels(), 180, 240}));
+    CHECK(labels.codes.shape() == (Shape{3, spec.dim}));
+    CHECK(labels.rows(0, 90, 120) == 0);  // the bottle is in the middle
+    CHECK(labels.rows(0, 0, 0) == 2);     // before a wall
+    CHECK(num_labelled(labels, spec) == spec.levels() * (180 * 240 - 552));  // all but its rim
+    // At half the size, every second pixel's label.
+    const ImageTransform t = plan_frame(240, 180, {FrameMode::kCrop, 126, false});
+    const Targets targets = paint(labels, spec, t, t.height, t.width);
+    CHECK(targets.features(0, t.height / 2, t.width / 2, 0) == labels.codes(0, 0));
+    CHECK(targets.mask(0, 0, 0) == 1);
+  }
 }

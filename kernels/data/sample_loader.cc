@@ -317,6 +317,12 @@ LoaderPosition SampleLoader::position() const {
 
 std::int64_t SampleLoader::batches_per_epoch() const { return state_->batches_per_epoch; }
 
+std::int64_t SampleLoader::count_batches(const TrainingSet& set, const LoaderOptions& options) {
+  loader_detail::State state(set, options, {});
+  state.prepare();
+  return state.batches_per_epoch;
+}
+
 std::int64_t SampleLoader::num_skipped() const {
   const std::lock_guard lock(state_->mutex);
   return state_->num_skipped;

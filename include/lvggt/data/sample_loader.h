@@ -102,6 +102,9 @@ class SampleLoader {
   // Samples replaced so far because they could not be read, by this rank.
   std::int64_t num_skipped() const;
 
+  // batches_per_epoch() of such a loader, without starting one. Errors: those of the constructor.
+  static std::int64_t count_batches(const TrainingSet& set, const LoaderOptions& options);
+
   // Bytes of all batches that can be in memory at once (those read ahead, the one in use, the one
   // it is exchanged for) and of the reading threads.
   static std::size_t planned_bytes(const TrainingSet& set, const LoaderOptions& options);
