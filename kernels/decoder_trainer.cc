@@ -238,6 +238,8 @@ StepReport DecoderTrainer::step(const DecoderBatch& batch) {
     report.refused = entry ? "the gradient of " + entry->name + " is not finite"
                            : std::string("the norm of the gradient is not finite");
   }
+  if (!report.refused && options_.judge)
+    report.refused = options_.judge(report.loss, report.grad_norm);
   const bool refused_elsewhere = communicator_.any(report.refused.has_value());
   if (refused_elsewhere && !report.refused) report.refused = "another rank refused the step";
   if (report.refused) return report;

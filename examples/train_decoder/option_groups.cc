@@ -73,8 +73,8 @@ void add_model(Program& program, Options& o) {
   app.add_option("--out-channels", o.out_channels, "Channels of the four maps the DPT starts from")
       ->expected(4)
       ->delimiter(',')
-      ->check(CLI::Range(1, 65536))
-      ->type_name("N,N,N,N")
+      ->check(CLI::Range(1, 65536).description(""))
+      ->type_name("N")
       ->default_str("the configuration's, 256,512,1024,1024 as published");
   add_word(program, "--head", o.head, {"unet", "mlp"},
            "Heads: UNets, or the paper's ablation with 1x1 convolutions")
@@ -128,8 +128,9 @@ void add_optimiser(Program& program, Options& o) {
       "Process a batch in N parts to save memory; batch norms then see "
       "the statistics of one part only",
       1, 65536);
-  add_word(program, "--batch-norm", o.batch_norm, {"synchronised", "per-rank"},
-           "With several ranks: batch statistics over all of them, or each its own as the release")
+  add_word(program, "--batch-norm", o.batch_norm, {"synchronised", "per-rank", "frozen"},
+           "synchronised: batch statistics, with several ranks over all of them; per-rank: each "
+           "its own, as the release; frozen: the running statistics, which stay as they are")
       ->capture_default_str();
   program.add_number<std::int64_t>("--epochs", o.epochs, "Passes over the frames", 1, kMany)
       ->default_str("100");
@@ -183,14 +184,30 @@ void add_running(Program& program, Options& o) {
                     "Refuse to start if more is needed; otherwise what is free");
 }
 
+// Puts the options that were added since the last call under a heading of their own.
+void name_group(Program& program, const std::string& heading) {
+  for (CLI::Option* option : program.app().get_options()) {
+    const bool positional = option->get_positional();
+    const std::string name = option->get_name();
+    if (!positional && name != "--help" && name != "-h,--help" && name != "--version" &&
+        option->get_group() == "Options")
+      option->group(heading);
+  }
+}
+
 }  // namespace
 
 void add_options(Program& program, Options& options) {
   add_data(program, options);
+  name_group(program, "Data");
   add_model(program, options);
+  name_group(program, "Decoder");
   add_losses(program, options);
+  name_group(program, "Losses");
   add_optimiser(program, options);
+  name_group(program, "Optimiser and schedule");
   add_running(program, options);
+  name_group(program, "Running");
   program.app().footer(
       "A run, from labelled scene to language field:\n"
       "  make_tokens scene --weights model.safetensors            once: what the frozen encoder "

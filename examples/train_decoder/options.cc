@@ -34,6 +34,7 @@ void Options::settle() {
   train.activations =
       checkpoint_activations ? CheckpointActivations::kRecompute : CheckpointActivations::kKeep;
   train.synchronise_batch_norm = batch_norm == "synchronised";
+  train.frozen_batch_norm = batch_norm == "frozen";
   if (batch % train.accumulate != 0)
     fail(ErrorKind::kUsage, "--accumulate: ", train.accumulate, " parts do not divide a batch of ",
          batch);

@@ -45,7 +45,7 @@ Session::Session(const Options& options, const Setup& setup, Ranks& ranks,
       record_(record),
       ctx_(ctx),
       store_(setup.config, setup.train.ema_decay > 0),
-      trainer_(store_, setup.train, ranks.communicator(), ctx),
+      trainer_(store_, judged(setup.train), ranks.communicator(), ctx),
       held_out_(setup.set, setup.config, options.sheet_columns),
       progress_(!ranks.first()) {}
 
@@ -124,8 +124,15 @@ std::string Session::start() {
   return training_sha256(store_);
 }
 
+// The same options; with --outlier-z, steps far off the last ones are refused.
+TrainOptions Session::judged(const TrainOptions& options) {
+  TrainOptions with_judge = options;
+  if (options_.outlier_z > 0)
+    with_judge.judge = [this](const LossTerms& loss, double norm) { return judge(loss, norm); };
+  return with_judge;
+}
+
 std::optional<std::string> Session::judge(const LossTerms& loss, double grad_norm) {
-  if (options_.outlier_z == 0) return std::nullopt;
   const auto loss_z = losses_.add(loss.total), norm_z = norms_.add(grad_norm);
   for (const auto& [what, z] : {std::pair{"loss", loss_z}, {"gradient norm", norm_z}})
     if (z && *z > options_.outlier_z)

@@ -53,6 +53,7 @@ class Session {
 
   void step();
   void report_step(const lvggt::StepReport& report, const lvggt::Batch& batch, double seconds);
+  lvggt::TrainOptions judged(const lvggt::TrainOptions& options);
   void count_refused(const lvggt::StepReport& report);
   std::optional<std::string> judge(const lvggt::LossTerms& loss, double grad_norm);
   int finish(bool interrupted);

@@ -52,6 +52,7 @@ class ChildProcess {
   ChildProcess(const ChildProcess&) = delete;
   ChildProcess& operator=(const ChildProcess&) = delete;
 
+  pid_t pid() const { return pid_; }
   void send(int signal_number) const { ::kill(pid_, signal_number); }
 
   // Whether the child is still there.

@@ -83,7 +83,8 @@ inline std::vector<std::array<double, 2>> moving_average(
   return smooth;
 }
 
-// Draws panels below each other, each with axes, ticks, grid, title and legend, dark on white.
+// Draws panels below each other, each with axes, ticks, grid, title and legend, dark on white. They
+// share one range of x, so that what happens at the same x stands below each other.
 class LinePlot {
  public:
   LinePlot(std::int64_t width, std::int64_t panel_height)
@@ -98,9 +99,22 @@ class LinePlot {
     Tensor<std::uint8_t, 3> picture(
         Shape{panel_height_ * static_cast<std::int64_t>(panels.size()), width_, std::int64_t{3}});
     std::fill_n(picture.data(), picture.size(), std::uint8_t{255});
+    std::vector<Axes> axes;
+    constexpr double kInfinity = std::numeric_limits<double>::infinity();
+    double x_low = kInfinity, x_high = -kInfinity;
+    for (const PlotPanel& panel : panels) {
+      axes.push_back(axes_of(panel));
+      if (axes.back().empty) continue;
+      x_low = std::min(x_low, axes.back().x_low);
+      x_high = std::max(x_high, axes.back().x_high);
+    }
     for (std::size_t i = 0; i < panels.size(); ++i) {
       const std::int64_t top = static_cast<std::int64_t>(i) * panel_height_;
-      draw_panel(picture.view().narrow(0, top, top + panel_height_), panels[i]);
+      if (x_low < x_high) {
+        axes[i].x_low = x_low;
+        axes[i].x_high = x_high;
+      }
+      draw_panel(picture.view().narrow(0, top, top + panel_height_), panels[i], axes[i]);
     }
     return picture;
   }
@@ -112,7 +126,7 @@ class LinePlot {
   // Where numbers are on the picture.
   struct Axes {
     double x_low = 0, x_high = 1, y_low = 0, y_high = 1;
-    bool logarithmic = false;
+    bool logarithmic = false, empty = true;
     double left = 0, right = 0, top = 0, bottom = 0;
 
     double x(double value) const {
@@ -147,6 +161,7 @@ class LinePlot {
       }
     if (!(x_low <= x_high)) return axes;  // nothing to show
     const double y_room = y_high > y_low ? 0.05 * (y_high - y_low) : 0.5 * std::abs(y_low) + 0.1;
+    axes.empty = false;
     axes.x_low = x_low;
     axes.x_high = x_high > x_low ? x_high : x_low + 1;
     axes.y_low = y_low - y_room;
@@ -154,8 +169,7 @@ class LinePlot {
     return axes;
   }
 
-  void draw_panel(View<std::uint8_t, 3> picture, const PlotPanel& panel) const {
-    const Axes axes = axes_of(panel);
+  void draw_panel(View<std::uint8_t, 3> picture, const PlotPanel& panel, const Axes& axes) const {
     draw_axes(picture, axes);
     draw_label(picture, kLeft, 8, panel.title, 1, kInk);
     draw_label(picture, (kLeft + width_ - kRight - label_width(panel.x_label, 1)) / 2,

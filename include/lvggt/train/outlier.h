@@ -28,9 +28,11 @@ class OutlierDetector {
     if (values_.size() >= kFewest) {
       const auto n = static_cast<double>(values_.size());
       double mean = 0, variance = 0;
-      for (const double x : values_) mean += x / n;
+      for (const double x : values_) mean += x;
+      mean /= n;
       for (const double x : values_) variance += (x - mean) * (x - mean) / n;
-      if (variance > 0) z = (value - mean) / std::sqrt(variance);
+      // What rounding alone makes of equal values is no deviation.
+      if (std::sqrt(variance) > 1e-9 * std::abs(mean)) z = (value - mean) / std::sqrt(variance);
     }
     values_.push_back(value);
     if (values_.size() > kWindow) values_.pop_front();

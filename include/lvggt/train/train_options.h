@@ -2,6 +2,9 @@
 #pragma once
 
 #include <cstdint>
+#include <functional>
+#include <optional>
+#include <string>
 
 #include "lvggt/train/adamw.h"
 #include "lvggt/train/schedule.h"
@@ -47,6 +50,9 @@ struct TrainOptions {
   bool frozen_batch_norm = false;
   // Batch statistics over the frames of all ranks; false: each rank its own, like the release.
   bool synchronise_batch_norm = true;
+  // Called with the losses and the gradient's norm of every finite step; a sentence it returns
+  // refuses the step. All ranks see the same numbers and must answer alike.
+  std::function<std::optional<std::string>(const LossTerms& loss, double grad_norm)> judge;
 };
 
 }  // namespace lvggt
