@@ -138,7 +138,7 @@ int Ranks::guarded(const std::function<int()>& body) {
                "stays valid (--resume)\n",
                rank(), size(), sentence.c_str());
 #ifdef LVGGT_HAS_MPI
-  static_cast<MpiCommunicator&>(*communicator_).abort(status);
+  static_cast<MpiCommunicator&>(*communicator_).end_all(status);
 #else
   return status;
 #endif

@@ -147,7 +147,7 @@ std::vector<std::string> MpiCommunicator::gather(const std::string& text) {
   return texts;
 }
 
-void MpiCommunicator::abort(int status) {
+void MpiCommunicator::end_all(int status) {
   MPI_Abort(MPI_COMM_WORLD, status);
   // MPI_Abort does not return; the compiler does not know.
   for (;;) std::this_thread::sleep_for(std::chrono::seconds(1));

@@ -72,7 +72,7 @@ int hang(lvggt::MpiCommunicator& comm) {
     comm.any(false);
   } catch (const lvggt::LostRank& error) {
     std::fprintf(stderr, "%s\n", error.what());
-    comm.abort(7);
+    comm.end_all(7);
   }
   return 0;
 }

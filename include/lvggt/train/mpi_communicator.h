@@ -12,7 +12,7 @@
 namespace lvggt {
 
 // Another rank did not answer in time or MPI failed: this rank cannot go on, and no call to the
-// communicator makes sense any more but abort(). A program's exit status for it is 1.
+// communicator makes sense any more but end_all(). A program's exit status for it is 1.
 class LostRank : public Error {
  public:
   explicit LostRank(const std::string& message) : Error(ErrorKind::kWrite, message) {}
@@ -27,7 +27,7 @@ class MpiCommunicator final : public Communicator {
   // the other ranks before it throws LostRank.
   explicit MpiCommunicator(double timeout);
   // Finalises MPI if it was initialised here; waits for the other ranks, so a rank that fails calls
-  // abort() instead.
+  // end_all() instead.
   ~MpiCommunicator() override;
   MpiCommunicator(const MpiCommunicator&) = delete;
   MpiCommunicator& operator=(const MpiCommunicator&) = delete;
@@ -44,7 +44,7 @@ class MpiCommunicator final : public Communicator {
   std::vector<std::string> gather(const std::string& text);
 
   // Ends all ranks at once with this exit status.
-  [[noreturn]] void abort(int status);
+  [[noreturn]] void end_all(int status);
 
  private:
   struct State;
