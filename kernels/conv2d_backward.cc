@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Backward passes of the three layers that are products: conv2d, conv_transpose2d, linear.
 #include <algorithm>
-#include <vector>
 
+#include "kernels/conv2d_product.h"
 #include "kernels/pack.h"
 #include "kernels/product.h"
 #include "kernels/tap_gather.h"
@@ -45,8 +45,11 @@ class InputGradient {
     const Phase across = phase_of(phase_x, dx_.extent(2), kernel, stride_, padding_);
     const std::int64_t M = dx_.extent(0) * down.inputs * across.inputs;
     if (M == 0) return;
-    const PackedMatrix w = packed(down, across, ctx);
-    const kernels::Product product{M, &w, w.taps, w.K, nullptr, Activation::kNone, nullptr, false};
+    Arena::Scope scope(ctx.arena());
+    const std::int64_t taps = std::max<std::int64_t>(1, down.taps * across.taps);
+    const kernels::PackedPanels w = packed(down, across, ctx);
+    const kernels::Product product{M,       w,    taps, dy_.extent(3), nullptr, Activation::kNone,
+                                   nullptr, false};
     // Input p = phase + stride i reads, through its j-th tap, output i + first - j.
     const auto axis = [&](const Phase& p, std::int64_t phase) {
       return kernels::TapAxis{std::max<std::int64_t>(1, p.taps), 1,
@@ -66,17 +69,22 @@ class InputGradient {
   }
 
   // The phase's taps, input and output channels exchanged.
-  PackedMatrix packed(const Phase& down, const Phase& across, Context& ctx) const {
-    const std::int64_t Cout = weight_.extent(0), Cin = weight_.extent(1);
-    // Without a tap nothing reads these pixels: a tap of zero weights gives them gradient 0.
-    const std::int64_t taps = std::max<std::int64_t>(1, down.taps * across.taps);
-    if (down.taps * across.taps == 0) return kernels::empty_matrix(Cin, taps, Cout, Storage::kF32);
-    std::vector<std::int64_t> offsets;
-    for (std::int64_t t = 0; t < taps; ++t)
-      offsets.push_back(tap(down, t / across.taps) * weight_.stride(2) +
-                        tap(across, t % across.taps));
-    return kernels::pack_strided(weight_.data(), Cin, weight_.stride(1), Cout, weight_.stride(0),
-                                 offsets, ctx);
+  kernels::PackedPanels packed(const Phase& down, const Phase& across, Context& ctx) const {
+    const std::int64_t count = down.taps * across.taps;
+    if (count == 0) {
+      // Nothing reads these pixels: one tap of zero weights gives them gradient 0.
+      const std::int64_t values = num_panels(weight_.extent(1)) * kPanelWidth * weight_.extent(0);
+      const View<float, 1> zeros = ctx.arena().alloc(Shape{values});
+      std::fill_n(zeros.data(), values, 0.0f);
+      return kernels::PackedPanels(weight_.extent(1), zeros.data());
+    }
+    const View<std::int64_t, 1> taps = ctx.arena().alloc<std::int64_t>(Shape{count});
+    for (std::int64_t t = 0; t < count; ++t)
+      taps[t] = tap(down, t / across.taps) * weight_.stride(2) +
+                tap(across, t % across.taps) * weight_.stride(3);
+    return kernels::pack_in_arena({weight_.data(), weight_.extent(1), weight_.stride(1),
+                                   weight_.extent(0), weight_.stride(0), taps},
+                                  ctx);
   }
 
   View<float, 4> dx_;
@@ -86,6 +94,21 @@ class InputGradient {
   std::int64_t padding_;
   View<float, 1> zeros_;
 };
+
+// With stride 1 there is one phase, and dx is the convolution of dy with the filters turned by 180
+// degrees, input and output channels exchanged.
+void input_gradient_of_stride_1(View<float, 4> dx, View<const float, 4> dy,
+                                View<const float, 4> weight, std::int64_t padding, Context& ctx) {
+  const std::int64_t Cout = weight.extent(0), Cin = weight.extent(1), kernel = weight.extent(2);
+  Arena::Scope scope(ctx.arena());
+  const View<std::int64_t, 1> taps = ctx.arena().alloc<std::int64_t>(Shape{kernel * kernel});
+  for (std::int64_t t = 0; t < taps.extent(0); ++t)
+    taps[t] =
+        (kernel - 1 - t / kernel) * weight.stride(2) + (kernel - 1 - t % kernel) * weight.stride(3);
+  const kernels::PackedPanels w = kernels::pack_in_arena(
+      {weight.data(), Cin, weight.stride(1), Cout, weight.stride(0), taps}, ctx);
+  kernels::run_conv2d(dx, dy, {Cout, kernel, 1, kernel - 1 - padding}, w, {}, ctx);
+}
 
 // [M, C] as [1, 1, M, C]
 template <class T>
@@ -133,6 +156,8 @@ void conv2d_backward(View<float, 4> dx, View<float, 4> dweight, View<float, 1> d
     kernels::bias_gradient(dbias, dy, ctx);
   }
   if (dx.empty()) return;
+  if (stride == 1 && padding < kernel)
+    return input_gradient_of_stride_1(dx, dy, weight, padding, ctx);
   Arena::Scope scope(ctx.arena());
   const InputGradient gradient(dx, dy, weight, stride, padding, ctx);
   for (std::int64_t phase = 0; phase < stride * stride; ++phase)
@@ -162,7 +187,7 @@ void conv_transpose2d_backward(View<float, 4> dx, View<float, 4> dweight, View<f
   // this one, [Cout, Cin, k, k] of that convolution.
   if (dweight) kernels::weight_gradient(dweight, {}, x, dy, k, 0, ctx);
   if (dbias) kernels::bias_gradient(dbias, dy, ctx);
-  if (dx) conv2d_forward(dx, dy, pack_conv2d(weight, k, 0, ctx), {}, ctx);
+  if (dx) conv2d_forward(dx, dy, weight, k, 0, {}, ctx);
 }
 
 void linear_backward(View<float, 2> dx, View<float, 2> dweight, View<float, 1> dbias,

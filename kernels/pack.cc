@@ -23,12 +23,10 @@ PackedMatrix empty_matrix(std::int64_t N, std::int64_t taps, std::int64_t K, Sto
   return matrix;
 }
 
-PackedMatrix pack_strided(const float* weight, std::int64_t N, std::int64_t n_stride,
-                          std::int64_t K, std::int64_t k_stride,
-                          std::span<const std::int64_t> tap_offsets, Context& ctx) {
-  const std::int64_t taps = std::ssize(tap_offsets);
-  PackedMatrix packed = empty_matrix(N, taps, K, Storage::kF32);
-  const std::int64_t panels = num_panels(N);
+PackedPanels pack_in_arena(const WeightLayout& weight, Context& ctx) {
+  const std::int64_t taps = weight.taps.extent(0), K = weight.K;
+  const std::int64_t panels = num_panels(weight.N);
+  const View<float, 3> lines = ctx.arena().alloc(Shape{panels, taps * K, kPanelWidth});
   // Parts of a panel's channels too, so that few wide panels are shared out as well.
   constexpr std::int64_t kGrain = 64;
   const std::int64_t parts = (K + kGrain - 1) / kGrain;
@@ -36,35 +34,32 @@ PackedMatrix pack_strided(const float* weight, std::int64_t N, std::int64_t n_st
       panels * parts,
       [&](std::int64_t chunk, int) {
         const std::int64_t panel = chunk / parts, first = chunk % parts * kGrain;
-        const std::int64_t width = std::min(kPanelWidth, N - panel * kPanelWidth);
-        const float* from = weight + panel * kPanelWidth * n_stride;
-        float* to = reinterpret_cast<float*>(packed.panels.data()) + panel * taps * K * kPanelWidth;
+        const std::int64_t width = std::min(kPanelWidth, weight.N - panel * kPanelWidth);
+        const float* from = weight.data + panel * kPanelWidth * weight.n_stride;
+        float* to = lines[panel].data();
         const std::int64_t last = std::min(K, first + kGrain);
-        const auto set = [&](std::int64_t j, std::int64_t k) {
+        const auto set = [&](std::int64_t n, std::int64_t k) {
           for (std::int64_t t = 0; t < taps; ++t)
-            to[(t * K + k) * kPanelWidth + j] =
-                from[j * n_stride + k * k_stride + tap_offsets[static_cast<std::size_t>(t)]];
+            to[(t * K + k) * kPanelWidth + n] =
+                from[n * weight.n_stride + k * weight.k_stride + weight.taps[t]];
         };
         // Neighbours in memory one after the other: rows a power of two apart share cache sets.
-        if (n_stride < k_stride) {
+        if (weight.n_stride < weight.k_stride) {
           for (std::int64_t k = first; k < last; ++k)
-            for (std::int64_t j = 0; j < width; ++j) set(j, k);
+            for (std::int64_t n = 0; n < width; ++n) set(n, k);
         } else {
-          for (std::int64_t j = 0; j < width; ++j)
-            for (std::int64_t k = first; k < last; ++k) set(j, k);
+          for (std::int64_t n = 0; n < width; ++n)
+            for (std::int64_t k = first; k < last; ++k) set(n, k);
         }
+        for (std::int64_t t = 0; t < taps && width < kPanelWidth; ++t)
+          for (std::int64_t k = first; k < last; ++k)
+            std::fill_n(to + (t * K + k) * kPanelWidth + width, kPanelWidth - width, 0.0f);
       },
       ctx);
-  return packed;
+  return PackedPanels(weight.N, lines.data());
 }
 
 }  // namespace kernels
-
-PackedMatrix pack_linear(View<const float, 2> weight, Context& ctx) {
-  const std::int64_t tap = 0;
-  return kernels::pack_strided(weight.data(), weight.extent(0), weight.stride(0), weight.extent(1),
-                               1, {&tap, 1}, ctx);
-}
 
 namespace {
 

@@ -2,9 +2,7 @@
 // Private: weights into panels.
 #pragma once
 
-#include <span>
-
-#include "lvggt/core/context.h"
+#include "kernels/product.h"
 #include "lvggt/core/float16.h"
 #include "lvggt/kernels/packed_matrix.h"
 
@@ -32,11 +30,17 @@ inline void set_weight(PackedMatrix& matrix, std::int64_t n, std::int64_t line, 
   }
 }
 
-// A float32 matrix from weights in any order, on the threads of ctx: for training, where they
-// change with every step. Line t * K + k of output channel n is
-//   weight[n * n_stride + k * k_stride + tap_offsets[t]]
-PackedMatrix pack_strided(const float* weight, std::int64_t N, std::int64_t n_stride,
-                          std::int64_t K, std::int64_t k_stride,
-                          std::span<const std::int64_t> tap_offsets, Context& ctx);
+// Weights of which element (n, tap, k) lies at data + n * n_stride + k * k_stride + taps[tap].
+struct WeightLayout {
+  const float* data = nullptr;
+  std::int64_t N = 0;
+  std::int64_t n_stride = 0;
+  std::int64_t K = 0;
+  std::int64_t k_stride = 0;
+  View<const std::int64_t, 1> taps;
+};
+
+// The same as f32 panels in the arena's current scope: for weights that change with every use.
+PackedPanels pack_in_arena(const WeightLayout& weight, Context& ctx);
 
 }  // namespace lvggt::kernels

@@ -60,12 +60,12 @@ Panels block_panels(const Product& p, std::int64_t panel, std::int64_t count, st
                     std::int64_t num_lines, const ChunkScratch& scratch) {
   const std::int64_t panel_lines = p.taps * p.K;
   const std::int64_t first = (panel * panel_lines + line) * kPanelWidth;
-  if (p.w->storage == Storage::kF32) {
-    return {reinterpret_cast<const float*>(p.w->panels.data()) + first, panel_lines * kPanelWidth};
+  if (p.w.storage == Storage::kF32) {
+    return {reinterpret_cast<const float*>(p.w.panels) + first, panel_lines * kPanelWidth};
   }
   for (std::int64_t i = 0; i < count; ++i) {
-    widen_lines(p.w->storage, p.w->panels.data() + 2 * (first + i * panel_lines * kPanelWidth),
-                num_lines, scratch.widened + i * kMostLines * kPanelWidth);
+    widen_lines(p.w.storage, p.w.panels + 2 * (first + i * panel_lines * kPanelWidth), num_lines,
+                scratch.widened + i * kMostLines * kPanelWidth);
   }
   return {scratch.widened, kMostLines * kPanelWidth};
 }
@@ -74,10 +74,10 @@ Panels block_panels(const Product& p, std::int64_t panel, std::int64_t count, st
 Prefetch prefetch_panels(const Product& p, std::int64_t panel, std::int64_t count,
                          std::int64_t line, std::int64_t num_lines, std::int64_t parts) {
   const std::int64_t line_bytes =
-      kPanelWidth * static_cast<std::int64_t>(storage_bytes(p.w->storage));
+      kPanelWidth * static_cast<std::int64_t>(storage_bytes(p.w.storage));
   const std::int64_t panel_lines = p.taps * p.K;
-  return {p.w->panels.data() + (panel * panel_lines + line) * line_bytes, num_lines * line_bytes,
-          count, panel_lines * line_bytes, parts};
+  return {p.w.panels + (panel * panel_lines + line) * line_bytes, num_lines * line_bytes, count,
+          panel_lines * line_bytes, parts};
 }
 
 // A K block: `taps` taps of K values each, for all rows and panels of a chunk.
@@ -119,7 +119,7 @@ void run_block(const Product& p, const RowTable& table, std::int64_t panel0, std
     }
     float* sums = scratch.sums + first * kPanelWidth;
     const std::int64_t n0 = panel * kPanelWidth;
-    const std::int64_t n1 = std::min(p.w->N, n0 + count * kPanelWidth);
+    const std::int64_t n1 = std::min(p.w.N, n0 + count * kPanelWidth);
     const TileColumn column{block.rows,    table.count, block.row_stride,
                             block.taps,    block.K,     panels.lines,
                             panels.stride, sums,        kSumPitch};
@@ -186,7 +186,7 @@ HWY_EXPORT(run_chunk);
 HWY_EXPORT(tile_rows);
 
 void run_product(const Product& product, FunctionRef<void(const RowTable&)> gather, Context& ctx) {
-  const PackedMatrix& w = *product.w;
+  const PackedPanels& w = product.w;
   const std::int64_t panels = num_panels(w.N);
   if (product.M == 0 || panels == 0) return;
   const Chunks chunks =

@@ -2,6 +2,7 @@
 // Private: the product behind linear, convolution and transposed convolution.
 #pragma once
 
+#include <cstddef>
 #include <cstdint>
 
 #include "kernels/chunks.h"
@@ -34,10 +35,29 @@ struct RowTable {
   const float** residual = nullptr;  // [capacity]; unused without a residual
 };
 
+// Packed weights, wherever they lie: in a PackedMatrix, or in scratch for one call.
+struct PackedPanels {
+  std::int64_t N = 0;  // output channels
+  Storage storage = Storage::kF32;
+  const std::byte* panels = nullptr;
+  const float* scales = nullptr;              // int8 only
+  const std::int32_t* weight_sums = nullptr;  // int8 only
+
+  PackedPanels() = default;
+  PackedPanels(const PackedMatrix& matrix)  // NOLINT: implicit by design
+      : N(matrix.N),
+        storage(matrix.storage),
+        panels(matrix.panels.data()),
+        scales(matrix.scales.data()),
+        weight_sums(matrix.weight_sums.data()) {}
+  PackedPanels(std::int64_t channels, const float* values)
+      : N(channels), panels(reinterpret_cast<const std::byte*>(values)) {}
+};
+
 // y[m] = residual[m] + gamma * activation(sum over taps t of x[t][m] w_t^T + bias)
 struct Product {
   std::int64_t M = 0;
-  const PackedMatrix* w = nullptr;
+  PackedPanels w;
   std::int64_t taps =
       0;  // taps * K lines a panel: the weight's own, or neighbouring taps read as one
   std::int64_t K = 0;

@@ -131,8 +131,8 @@ void dequantize(const Product& p, const QuantizedRows& x, std::int64_t row0, std
     for (std::int64_t i = 0; i < channels; i += kLanes) {
       const auto sum = hn::BitCast(di, hn::LoadU(d, row + i));
       const auto offset =
-          hn::Mul(hn::LoadU(di, p.w->weight_sums.data() + n0 + i), hn::Set(di, kActivationZero));
-      const auto scale = hn::Mul(row_scale, hn::LoadU(d, p.w->scales.data() + n0 + i));
+          hn::Mul(hn::LoadU(di, p.w.weight_sums + n0 + i), hn::Set(di, kActivationZero));
+      const auto scale = hn::Mul(row_scale, hn::LoadU(d, p.w.scales + n0 + i));
       hn::StoreU(hn::Mul(hn::ConvertTo(d, hn::Sub(sum, offset)), scale), d, row + i);
     }
   }
@@ -149,7 +149,7 @@ void run_int8_chunk(const Product& p, const QuantizedRows& x, const RowTable& ta
   for (std::int64_t k = 0; k < quads; k += kBlockQuads) {
     const std::int64_t count_k = std::min(kBlockQuads, quads - k);
     for_panel_groups(panel1 - panel0, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
-      const auto* panels = reinterpret_cast<const std::int8_t*>(p.w->panels.data()) +
+      const auto* panels = reinterpret_cast<const std::int8_t*>(p.w.panels) +
                            (panel0 + first) * panel_stride + k * kPanelWidth * 4;
       const std::int64_t n0 = (panel0 + first) * kPanelWidth;
       float* group = sums + first * kPanelWidth;
@@ -164,7 +164,7 @@ void run_int8_chunk(const Product& p, const QuantizedRows& x, const RowTable& ta
         if (k + count_k < quads) continue;
         const std::int64_t last = std::min(table.count, r + kInt8Rows);
         dequantize(p, x, table.begin, r, last, n0, count * kPanelWidth, group);
-        finish_any(p, table, group, r, last, n0, std::min(p.w->N, n0 + count * kPanelWidth));
+        finish_any(p, table, group, r, last, n0, std::min(p.w.N, n0 + count * kPanelWidth));
       }
     });
   }
@@ -184,7 +184,7 @@ HWY_EXPORT(int8_tile_rows);
 void run_product_int8(const Product& product, View<const float, 2> x,
                       FunctionRef<void(const RowTable&)> gather, Context& ctx) {
   const std::int64_t M = product.M, K = product.K;
-  const std::int64_t panels = num_panels(product.w->N);
+  const std::int64_t panels = num_panels(product.w.N);
   if (M == 0 || panels == 0) return;
   Arena::Scope scope(ctx.arena());
   // Room for a whole vector beyond K; an odd number of cache lines, so that rows do not compete for

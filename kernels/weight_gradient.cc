@@ -224,11 +224,16 @@ void add_shares(const WeightGradientPlan& plan, View<float, 4> dweight, View<con
   }
   const std::int64_t ci_end = std::min(plan.x[3], (group + 1) * plan.tile_rows);
   const std::int64_t co_end = std::min(plan.dy[3], (panel + 1) * kPanelWidth);
-  for (std::int64_t co = panel * kPanelWidth; co < co_end; ++co)
-    for (std::int64_t ci = group * plan.tile_rows; ci < ci_end; ++ci)
-      for (std::int64_t t = 0; t < plan.taps(); ++t)
-        dweight(co, ci, t / plan.kernel, t % plan.kernel) +=
-            total[(t * plan.tile_rows + ci % plan.tile_rows) * kPanelWidth + co % kPanelWidth];
+  const std::int64_t k = plan.kernel;
+  for (std::int64_t co = panel * kPanelWidth; co < co_end; ++co) {
+    for (std::int64_t ci = group * plan.tile_rows; ci < ci_end; ++ci) {
+      const float* from = total + ci % plan.tile_rows * kPanelWidth + co % kPanelWidth;
+      float* filter = dweight.data() + co * dweight.stride(0) + ci * dweight.stride(1);
+      for (std::int64_t ky = 0; ky < k; ++ky, filter += dweight.stride(2))
+        for (std::int64_t kx = 0; kx < k; ++kx, from += plan.tile_rows * kPanelWidth)
+          filter[kx * dweight.stride(3)] += *from;
+    }
+  }
 }
 
 // dbias += the shares' sums, in order.

@@ -107,6 +107,30 @@ TEST_CASE("conv2d_forward: y may be a slice of a concatenated map, x a crop") {
   });
 }
 
+TEST_CASE("conv2d_forward: weights packed for one call give the same bits as packed ones") {
+  Context ctx(2);
+  for_each_target([&] {
+    for (const Kernel& kernel :
+         {Kernel{3, 1, 1}, Kernel{3, 2, 1}, Kernel{2, 2, 0}, Kernel{1, 1, 0}}) {
+      const auto x = random_tensor(Shape{1, 8, 10, 19}, 1);
+      const auto w =
+          random_tensor(Shape{std::int64_t{37}, std::int64_t{19}, kernel.k, kernel.k}, 2);
+      const auto bias = random_tensor(Shape{37}, 3);
+      Tensor<float, 4> y(
+          Shape{std::int64_t{1}, conv2d_extent(8, kernel.k, kernel.stride, kernel.padding),
+                conv2d_extent(10, kernel.k, kernel.stride, kernel.padding), std::int64_t{37}});
+      Tensor<float, 4> packed(y.shape());
+      conv2d_forward(y, x, w, kernel.stride, kernel.padding, {.bias = bias}, ctx);
+      conv2d_forward(packed, x, pack_conv2d(w, kernel.stride, kernel.padding), {.bias = bias}, ctx);
+      CHECK_SAME_BITS(y, packed);
+    }
+  });
+  Tensor<float, 4> x(Shape{1, 6, 7, 3}), y(Shape{1, 6, 7, 5});
+  CHECK_THROWS_WITH_AS(
+      conv2d_forward(y, x, Tensor<float, 4>(Shape{5, 3, 3, 2}).view(), 1, 1, {}, ctx),
+      doctest::Contains("square"), Error);
+}
+
 TEST_CASE("conv2d_forward: NaN in a pixel reaches the pixels around it and no other") {
   Context ctx(1);
   for_each_target([&] {

@@ -133,6 +133,21 @@ TEST_CASE("conv_transpose2d_backward: shapes that do not fit are refused by name
                        doctest::Contains("square"), Error);
 }
 
+TEST_CASE("conv_transpose2d_forward: weights packed for one call give the same bits") {
+  Context ctx(2);
+  for_each_target([&] {
+    for (const std::int64_t k : {2, 4}) {
+      const auto x = random_tensor(Shape{1, 5, 6, 19}, 1);
+      const auto w = random_tensor(Shape{std::int64_t{19}, std::int64_t{21}, k, k}, 2);
+      const auto bias = random_tensor(Shape{21}, 3);
+      Tensor<float, 4> y(Shape{std::int64_t{1}, 5 * k, 6 * k, std::int64_t{21}}), packed(y.shape());
+      conv_transpose2d_forward(y, x, w, bias, ctx);
+      conv_transpose2d_forward(packed, x, pack_conv_transpose2d(w), bias, ctx);
+      CHECK_SAME_BITS(y, packed);
+    }
+  });
+}
+
 TEST_CASE("conv_transpose2d_forward: 1 and 8 threads give the same bits") {
   Context one(1), eight(8);
   const auto x = random_tensor(Shape{1, 21, 37, 48}, 1);

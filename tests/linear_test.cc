@@ -194,3 +194,15 @@ TEST_CASE("linear_backward: rows and channels across every block, and wrong shap
   CHECK_THROWS_WITH_AS(linear_backward(dx, {}, {}, x, {}, w, ctx), doctest::Contains("1000,310"),
                        Error);
 }
+
+TEST_CASE("linear_forward: a weight packed for one call gives the same bits, strided too") {
+  Context ctx(2);
+  const auto x = random_tensor(Shape{23, 70}, 1), w = random_tensor(Shape{37, 70}, 2);
+  for_each_target([&] {
+    Tensor<float, 2> y(Shape{23, 37}), packed(y.shape());
+    Strided<2> strided(w.view());
+    linear_forward(y, x, View<const float, 2>(strided.view()), {}, ctx);
+    linear_forward(packed, x, pack_linear(w), {}, ctx);
+    CHECK_SAME_BITS(y, packed);
+  });
+}

@@ -21,10 +21,6 @@ struct PackedConv2d {
 PackedConv2d pack_conv2d(View<const float, 4> weight, std::int64_t stride, std::int64_t padding,
                          Storage storage = Storage::kF32);
 
-// The same in float32 on the threads of ctx: for training, where weights change with every step.
-PackedConv2d pack_conv2d(View<const float, 4> weight, std::int64_t stride, std::int64_t padding,
-                         Context& ctx);
-
 // Extent of the output along one axis: floor((in + 2 padding - kernel) / stride) + 1.
 constexpr std::int64_t conv2d_extent(std::int64_t in, std::int64_t kernel, std::int64_t stride,
                                      std::int64_t padding) {
@@ -36,6 +32,12 @@ constexpr std::int64_t conv2d_extent(std::int64_t in, std::int64_t kernel, std::
 //   y: [B, Ho, Wo, Cout]   x: [B, H, W, Cin]   y may be epilogue.residual, not x.
 void conv2d_forward(View<float, 4> y, View<const float, 4> x, const PackedConv2d& w,
                     const Epilogue<4>& epilogue, Context& ctx);
+
+// The same with weights [Cout, Cin, k, k] that are packed into scratch for this call: for training,
+// which changes them every step.
+void conv2d_forward(View<float, 4> y, View<const float, 4> x, View<const float, 4> weight,
+                    std::int64_t stride, std::int64_t padding, const Epilogue<4>& epilogue,
+                    Context& ctx);
 
 // Backward of y = conv2d(x, weight) + bias. With the loss L, dy = dL/dy, and input pixel
 // p = stride o + tap - padding of output pixel o,

@@ -21,15 +21,17 @@ struct PackedConvTranspose2d {
 PackedConvTranspose2d pack_conv_transpose2d(View<const float, 4> weight,
                                             Storage storage = Storage::kF32);
 
-// The same in float32 on the threads of ctx: for training, where weights change with every step.
-PackedConvTranspose2d pack_conv_transpose2d(View<const float, 4> weight, Context& ctx);
-
 // y[b, k*i + ky, k*j + kx, :] = sum over Cin of x[b, i, j, :] w[:, :, ky, kx] + bias, channels
 // last; pixels may be strided.
 //   y: [B, k*H, k*W, Cout]   x: [B, H, W, Cin]   bias: [Cout] or empty
 void conv_transpose2d_forward(View<float, 4> y, View<const float, 4> x,
                               const PackedConvTranspose2d& w, View<const float, 1> bias,
                               Context& ctx);
+
+// The same with weights [Cin, Cout, k, k] that are packed into scratch for this call: for training,
+// which changes them every step.
+void conv_transpose2d_forward(View<float, 4> y, View<const float, 4> x, View<const float, 4> weight,
+                              View<const float, 1> bias, Context& ctx);
 
 // Backward of conv_transpose2d_forward: it is a convolution with its input and output exchanged, so
 //   dx[i, j, ci]            = sum over ky, kx, co of dy[k i + ky, k j + kx, co] weight[ci, co, ky,

@@ -12,6 +12,11 @@ namespace lvggt {
 void linear_forward(View<float, 2> y, View<const float, 2> x, const PackedMatrix& w,
                     const Epilogue<2>& epilogue, Context& ctx);
 
+// The same with a weight [N, K] that is packed into scratch for this call: for training, which
+// changes it every step.
+void linear_forward(View<float, 2> y, View<const float, 2> x, View<const float, 2> weight,
+                    const Epilogue<2>& epilogue, Context& ctx);
+
 // Backward of y = x weight^T + bias:
 //   dx = dy weight     dweight += dy^T x     dbias += sum over rows of dy
 //   dx, x: [M, K]   dweight, weight: [N, K], unpacked   dbias: [N]   dy: [M, N]

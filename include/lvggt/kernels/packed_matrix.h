@@ -4,7 +4,6 @@
 #include <cstddef>
 #include <cstdint>
 
-#include "lvggt/core/context.h"
 #include "lvggt/core/storage.h"
 #include "lvggt/core/tensor.h"
 
@@ -45,9 +44,6 @@ inline constexpr int kInt8WeightMax = 63;
 // weight: [N, K], as a linear layer stores it. int8 rounds each output channel to multiples of its
 // largest magnitude / kInt8WeightMax.
 PackedMatrix pack_linear(View<const float, 2> weight, Storage storage = Storage::kF32);
-
-// The same in float32 on the threads of ctx: for training, where weights change with every step.
-PackedMatrix pack_linear(View<const float, 2> weight, Context& ctx);
 
 // The same from integers in [-kInt8WeightMax, kInt8WeightMax] and the scales of their channels,
 // which are packed as they are.   integers: [N, K]   scales: [N]

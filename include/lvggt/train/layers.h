@@ -41,9 +41,8 @@ Shape<4> conv2d_shape(const Conv2dParameters<T>& layer, const Shape<4>& x) {
 inline void conv2d_forward(View<float, 4> y, View<const float, 4> x,
                            const Conv2dParameters<const float>& layer, Activation activation,
                            View<const float, 4> residual, Context& ctx) {
-  const PackedConv2d packed = pack_conv2d(layer.weight, layer.stride, layer.padding, ctx);
-  conv2d_forward(y, x, packed, {.bias = layer.bias, .activation = activation, .residual = residual},
-                 ctx);
+  conv2d_forward(y, x, layer.weight, layer.stride, layer.padding,
+                 {.bias = layer.bias, .activation = activation, .residual = residual}, ctx);
 }
 
 inline void conv2d_backward(View<float, 4> dx, const Conv2dParameters<float>& gradient,
@@ -56,7 +55,7 @@ inline void conv2d_backward(View<float, 4> dx, const Conv2dParameters<float>& gr
 inline void conv_transpose2d_forward(View<float, 4> y, View<const float, 4> x,
                                      const ConvTranspose2dParameters<const float>& layer,
                                      Context& ctx) {
-  conv_transpose2d_forward(y, x, pack_conv_transpose2d(layer.weight, ctx), layer.bias, ctx);
+  conv_transpose2d_forward(y, x, layer.weight, layer.bias, ctx);
 }
 
 inline void conv_transpose2d_backward(View<float, 4> dx,
@@ -71,8 +70,8 @@ inline void conv_transpose2d_backward(View<float, 4> dx,
 inline void linear_forward(View<float, 2> y, View<const float, 2> x,
                            const LinearParameters<const float>& layer, Activation activation,
                            Context& ctx) {
-  linear_forward(y, x, pack_linear(layer.weight, ctx),
-                 Epilogue<2>{.bias = layer.bias, .activation = activation}, ctx);
+  linear_forward(y, x, layer.weight, Epilogue<2>{.bias = layer.bias, .activation = activation},
+                 ctx);
 }
 
 inline void linear_backward(View<float, 2> dx, const LinearParameters<float>& gradient,
