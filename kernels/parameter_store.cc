@@ -53,8 +53,13 @@ double fan_in(const std::vector<std::int64_t>& weight_shape) {
 
 }  // namespace
 
-ParameterStore::ParameterStore(const ModelConfig& config, bool average) : config_(config) {
-  for (const TensorSpec& spec : decoder_tensors(config)) {
+ParameterStore::ParameterStore(const ModelConfig& config, bool average)
+    : ParameterStore(decoder_tensors(config), average) {
+  config_ = config;
+}
+
+ParameterStore::ParameterStore(const std::vector<TensorSpec>& tensors, bool average) {
+  for (const TensorSpec& spec : tensors) {
     std::vector<ParameterEntry>& entries = is_buffer(spec.name) ? buffers_ : parameters_;
     by_name_.emplace(spec.name, entries.size());
     append(entries, spec);

@@ -26,6 +26,9 @@ void check_ops(Comparison& comparison, lvggt::Context& ctx);
 void check_train(Comparison& comparison, const std::string& name, const lvggt::LoadOptions& load,
                  const std::string& inputs, lvggt::Context& ctx);
 
+// adamw, in ops: three clipped steps on two tensors.
+void check_adamw(Comparison& comparison, lvggt::Context& ctx);
+
 // preprocess: image loading.
 void check_preprocess(Comparison& comparison);
 

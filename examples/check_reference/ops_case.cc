@@ -260,10 +260,9 @@ void check_cameras(const Operands& o, Comparison& comparison) {
 }
 
 // Why nothing is computed for a tensor, or null: the geometry model is frozen, so its operators
-// have no gradients, and the optimiser's steps are no operator.
+// have no gradients.
 const char* why_skipped(const std::string& op, const std::string& field) {
   static const char* const kFrozen[] = {"attention", "rope2d", "block_", "softmax", "activate_"};
-  if (op == "adamw") return "part of the optimiser";
   const bool frozen = std::any_of(std::begin(kFrozen), std::end(kFrozen),
                                   [&](const char* name) { return op.starts_with(name); });
   return frozen && field.starts_with("d") ? "the geometry model is not trained" : nullptr;
@@ -321,6 +320,7 @@ void check_ops(Comparison& comparison, Context& ctx) {
       ops.insert(op);
     }
   }
+  if (ops.erase("adamw") > 0) check_adamw(comparison, ctx);
   for (const std::string& op : ops) {
     check_op(comparison, op, ctx);
     check_op_backward(Operands(comparison, op, ctx));

@@ -12,6 +12,7 @@
 #include "lvggt/core/tensor.h"
 #include "lvggt/io/safetensors.h"
 #include "lvggt/model/config.h"
+#include "lvggt/model/tensor_list.h"
 
 namespace lvggt {
 
@@ -43,6 +44,9 @@ class ParameterStore {
  public:
   // All zero but the running variances, which are 1. `average`: with the moving average.
   explicit ParameterStore(const ModelConfig& config, bool average = false);
+
+  // The same for tensors of any names and shapes, without a configuration.
+  explicit ParameterStore(const std::vector<TensorSpec>& tensors, bool average = false);
 
   const ModelConfig& config() const { return config_; }
   bool has_average() const { return !average_.empty(); }
