@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "examples/train_decoder/setup.h"
 #include "lvggt/cli/progress.h"
 #include "lvggt/data/supervision.h"
 #include "lvggt/field/frame_pictures.h"
@@ -220,6 +221,7 @@ HeldOut::Result HeldOut::test(DecoderTrainer& trainer, bool averaged, std::int64
   sums.states.resize(2 * kMaxObjects * samples_.size());
   ContactSheet::Options options;
   options.max_columns = columns_;
+  options.cell_width = kSheetCellWidth;
   options.title = concat("held-out frames after step ", step);
   const auto ranks = static_cast<std::size_t>(communicator.size());
   const auto rank = static_cast<std::size_t>(communicator.rank());

@@ -50,13 +50,15 @@ Plan make_plan(const Setup& setup, const Options& options, int num_ranks) {
   const auto values = static_cast<std::size_t>(setup.config.sbd_levels * setup.config.lang_dim);
   const auto taps =
       static_cast<std::size_t>(4 * setup.largest_h * setup.largest_w * 2 * setup.config.embed_dim);
-  constexpr std::size_t kCellBytes = 176 * 176 * 3;
-  const auto cells =
-      static_cast<std::size_t>(4 * options.sheet_columns * (2 + 2 * setup.config.sbd_levels));
+  // The sheet keeps up to twice its columns, then draws and compresses them.
+  const std::int64_t cell_width = std::min<std::int64_t>(setup.largest_W, kSheetCellWidth);
+  const std::int64_t cell_height = cell_width * setup.largest_H / setup.largest_W + 1;
+  const auto cells = static_cast<std::size_t>(4 * options.sheet_columns * cell_width * cell_height *
+                                              3 * (3 + 2 * setup.config.sbd_levels));
   plan.testing = setup.set.samples(Part::kHeldOut).empty()
                      ? 0
-                     : 4 * (taps + pixels * (2 * values + 12)) + cells * kCellBytes;
-  plan.program = std::size_t{64} << 20;
+                     : 4 * (taps + pixels * (2 * values + 12)) + cells;
+  plan.program = std::size_t{32} << 20;
   return plan;
 }
 

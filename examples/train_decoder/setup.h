@@ -15,6 +15,9 @@
 
 namespace train_decoder {
 
+// Width of a picture on the contact sheet, in pixels; smaller ones are shown as they are.
+inline constexpr std::int64_t kSheetCellWidth = 176;
+
 // Memory the run will need on one rank.
 struct Plan {
   lvggt::TrainingMemory training;
