@@ -7,10 +7,10 @@
 #include <string>
 #include <string_view>
 
-#include "bench/frame_flops.h"
 #include "bench/peak.h"
 #include "bench/simd_option.h"
 #include "lvggt/lvggt.h"
+#include "lvggt/model/frame_flops.h"
 
 namespace {
 

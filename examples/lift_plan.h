@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <cstdio>
+#include <functional>
 #include <memory>
 #include <optional>
 #include <string>
@@ -10,10 +12,12 @@
 
 #include "examples/lift_options.h"
 #include "lvggt/cli/memory_check.h"
+#include "lvggt/cli/progress.h"
 #include "lvggt/cli/threads.h"
 #include "lvggt/io/video.h"
 #include "lvggt/lvggt.h"
 #include "lvggt/model/checkpoint.h"
+#include "lvggt/model/time_plan.h"
 
 // What lift_video knows before it starts: the input, its size, the memory the run will need.
 namespace lift_plan {
@@ -37,16 +41,20 @@ inline Input open_input(const LiftOptions& options) {
   return input;
 }
 
-// Memory beside the model's: the program itself and its libraries, the point cloud, the pictures of
-// a frame and of the contact sheet, and the decoding of the original.
+// Memory beside the model's: what this process holds by now (its libraries, the decoder of the
+// video, the first frame), the code it has yet to touch, the point cloud, the pictures of a frame
+// and of the contact sheet, and the decoding of the original.
 inline std::size_t program_bytes(const ImageTransform& transform, std::int64_t levels,
                                  std::int64_t lang_dim) {
+  constexpr std::size_t kCode = std::size_t{24} << 20;
   const auto pixels =
       static_cast<std::size_t>(transform.width) * static_cast<std::size_t>(transform.height);
   const auto original = static_cast<std::size_t>(transform.original_width) *
                         static_cast<std::size_t>(transform.original_height);
   const auto semantics = static_cast<std::size_t>(levels * (4 * lang_dim + 3));
-  return (std::size_t{64} << 20) + pixels * (80 + semantics) + original * 24;
+  // Before the first video of a list: later ones find the model there.
+  static const std::size_t process = cli::resident_bytes();
+  return process + kCode + pixels * (80 + semantics) + original * 24;
 }
 
 struct Plan {
@@ -54,55 +62,129 @@ struct Plan {
   std::size_t total = 0;
 };
 
+// Memory of the run with other options.
+using PlanOf = std::function<std::size_t(const LiftOptions&)>;
+
 inline Plan plan_run(const Checkpoint& checkpoint, const LiftOptions& options,
                      const ImageTransform& transform, std::int64_t past_frames) {
   StreamOptions stream = options.stream;
   stream.max_past_frames = past_frames;
   stream.decoder = stream.decoder && checkpoint.has_decoder();
+  const auto plan_with = [&](const StreamOptions& some) {
+    return plan_memory(checkpoint.config(), transform.height, transform.width, some,
+                       [&](const std::string& weight) {
+                         return options.weights.storage ? options.weights.storage->of_weight(weight)
+                                                        : checkpoint.storage_of(weight);
+                       });
+  };
   Plan plan;
-  plan.model =
-      plan_memory(checkpoint.config(), transform.height, transform.width, stream,
-                  [&](const std::string& weight) { return checkpoint.storage_of(weight); });
+  plan.model = plan_with(stream);
+  if (!stream.decoder && checkpoint.has_decoder()) {  // loaded, though it will not run
+    StreamOptions loaded = stream;
+    loaded.decoder = true;
+    const std::size_t weights = plan_with(loaded).weights;
+    plan.model.total += weights - plan.model.weights;
+    plan.model.weights = weights;
+  }
   plan.total = plan.model.total + program_bytes(transform, checkpoint.config().sbd_levels,
                                                 checkpoint.config().lang_dim);
   return plan;
 }
 
-// Frames the caches can hold at most in this run.
+// Past frames that the last frame of this run can see.
 inline std::int64_t reachable_past_frames(const LiftOptions& options, const Input& input) {
   const std::int64_t expected = input.source->expected_frames();
   const std::int64_t past = options.stream.max_past_frames;
-  return expected > 0 ? std::min(past, expected) : past;
+  return expected > 0 ? std::min(past, expected - 1) : past;
 }
 
 inline std::string breakdown(const Plan& plan) {
   return "weights " + cli::bytes_text(plan.model.weights) + ", cache of past frames " +
-         cli::bytes_text(plan.model.cache) + ", work " +
+         cli::bytes_text(plan.model.cache) + ", work and outputs " +
          cli::bytes_text(plan.total - plan.model.weights - plan.model.cache);
+}
+
+// Narrower storage that the run could have, from the mildest to the narrowest.
+inline std::vector<cli::MemoryChoice> storage_choices(const LiftOptions& options,
+                                                      const PlanOf& plan_of) {
+  std::vector<cli::MemoryChoice> choices;
+  for (const auto& [weights, cache] : {std::pair{"", "bf16"},
+                                       {"bf16", ""},
+                                       {"bf16", "bf16"},
+                                       {"", "int8"},
+                                       {"bf16", "int8"},
+                                       {"int8", "bf16"},
+                                       {"int8", "int8"}}) {
+    LiftOptions narrow = options;
+    std::string words;
+    if (*weights != 0) {
+      narrow.weights.storage = StoragePolicy::of(parse_storage(weights, ""));
+      words = concat("--weights-storage ", weights);
+    }
+    if (*cache != 0) {
+      narrow.stream.cache_storage = parse_storage(cache, "");
+      words += concat(words.empty() ? "" : " ", "--cache-storage ", cache);
+    }
+    choices.push_back({words, plan_of(narrow)});
+  }
+  return choices;
 }
 
 // Refuses the run when it needs more memory than it may have, and says which options would fit.
 inline void check_plan(const Plan& plan, const Checkpoint& checkpoint, const LiftOptions& options,
                        const Input& input) {
   cli::MemoryLimit limit = cli::available_memory();
+  // What this process holds already is part of the plan.
+  limit.bytes += std::min(cli::resident_bytes(), ~limit.bytes);
   if (options.memory_limit > 0 && options.memory_limit < limit.bytes)
     limit = {options.memory_limit, "--memory-limit"};
   const std::int64_t past = reachable_past_frames(options, input);
+  const auto total = [&](const LiftOptions& changed, const ImageTransform& transform,
+                         std::int64_t frames) {
+    return plan_run(checkpoint, changed, transform, frames).total;
+  };
   std::vector<cli::MemoryKnob> knobs;
-  knobs.push_back({"--max-past-frames", 1, past, 1, [&](std::int64_t frames) {
-                     return plan_run(checkpoint, options, input.transform, frames).total;
-                   }});
+  knobs.push_back({"--max-past-frames", 1, std::max<std::int64_t>(past, 1), 1,
+                   [&](std::int64_t frames) { return total(options, input.transform, frames); }});
+  const auto choices = storage_choices(
+      options, [&](const LiftOptions& narrow) { return total(narrow, input.transform, past); });
+  LiftOptions narrowest = options;
+  narrowest.weights.storage = StoragePolicy::of(Storage::kI8);
+  narrowest.stream.cache_storage = Storage::kI8;
+  const bool storage_fits =
+      std::any_of(choices.begin(), choices.end(),
+                  [&](const cli::MemoryChoice& choice) { return choice.bytes <= limit.bytes; });
+  if (!storage_fits)
+    knobs.push_back({"--weights-storage int8 --cache-storage int8 --max-past-frames", 1,
+                     std::max<std::int64_t>(past, 1), 1, [&](std::int64_t frames) {
+                       return total(narrowest, input.transform, frames);
+                     }});
   if (options.preprocess.mode != FrameMode::kOriginal)
     knobs.push_back(
         {"--size", 4 * kPatchSize, options.preprocess.size, kPatchSize, [&](std::int64_t size) {
            PreprocessOptions smaller = options.preprocess;
            smaller.size = static_cast<int>(size);
            const Image& image = input.next->image;
-           return plan_run(checkpoint, options, plan_frame(image.width(), image.height(), smaller),
-                           past)
-               .total;
+           return total(options, plan_frame(image.width(), image.height(), smaller), past);
          }});
-  cli::check_memory(plan.total, limit, breakdown(plan), knobs);
+  cli::check_memory(plan.total, limit, breakdown(plan), knobs, choices);
+}
+
+// How long the frames of the run will take, from a few layers timed on this machine.
+inline void print_times(const LiftOptions& options, const Input& input,
+                        const Checkpoint& checkpoint, int threads) {
+  StreamOptions stream = options.stream;
+  stream.decoder = stream.decoder && checkpoint.has_decoder();
+  stream.max_past_frames = reachable_past_frames(options, input);
+  Context ctx(threads);
+  const TimePlan plan = plan_time(
+      checkpoint.config(), input.transform.height, input.transform.width, stream,
+      [&](const std::string& weight) { return checkpoint.storage_of(weight); }, ctx);
+  const auto text = [](double seconds) { return cli::fixed(seconds, seconds < 1 ? 3 : 1) + " s"; };
+  std::printf(
+      "time          about %s of model time for the first frame, %s with %lld past frames\n",
+      text(plan.first_frame).c_str(), text(plan.full_window).c_str(),
+      static_cast<long long>(stream.max_past_frames));
 }
 
 inline void print_plan(const LiftOptions& options, const Input& input, const Plan& plan,

@@ -280,7 +280,10 @@ int lift_one(const LiftOptions& options, SharedModel& shared, const cli::Interru
       plan_run(checkpoint, options, input.transform, reachable_past_frames(options, input));
   if (options.dry_run) print_plan(options, input, plan, checkpoint, threads);
   check_plan(plan, checkpoint, options, input);
-  if (options.dry_run) return 0;
+  if (options.dry_run) {
+    print_times(options, input, checkpoint, threads.threads);
+    return 0;
+  }
 
   cli::RunRecord record = make_record(options, input, threads, argc, argv);
   record.planned_bytes = plan.total;
@@ -292,7 +295,8 @@ int lift_one(const LiftOptions& options, SharedModel& shared, const cli::Interru
     return earlier == "partial" ? kPartial : 0;
   }
   say(concat(threads.threads, threads.threads == 1 ? " thread (" : " threads (", threads.reason,
-             "), about ", cli::bytes_text(plan.total), " of memory"));
+             "), about ", cli::bytes_text(plan.total), " of memory (", breakdown(plan), ")"));
+  if (!checkpoint.all_f32()) say(checkpoint.storage_summary());
 
   Times times;
   const LangVggt& model = shared.get(times.load);

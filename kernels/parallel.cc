@@ -9,11 +9,17 @@
 #include <sanitizer/tsan_interface.h>
 #endif
 
+#include <algorithm>
 #include <array>
+#include <atomic>
+#include <chrono>
 #include <cmath>
 #include <fstream>
 #include <optional>
 #include <string>
+#include <thread>
+
+#include "kernels/thread_limits.h"
 
 namespace lvggt {
 
@@ -54,34 +60,37 @@ double quota_of(const std::string& directory) {
   return 0;
 }
 
-// The tightest CPU quota between this process's group and the root, 0 for none.
-double cgroup_quota() {
-  double tightest = 0;
-  const auto visit = [&](const std::string& root, std::string path) {
-    while (true) {
-      const double quota = quota_of(root + path);
-      if (quota > 0 && (tightest == 0 || quota < tightest)) tightest = quota;
-      const auto slash = path.rfind('/');
-      if (slash == std::string::npos || path.empty()) break;
-      path.resize(slash);
-    }
-  };
-  visit("/sys/fs/cgroup", cgroup_path(""));
-  visit("/sys/fs/cgroup/cpu", cgroup_path("cpu"));
-  return tightest;
+// The tightest CPU quota of this process's group in either version of control groups, 0 for none.
+double quota_of_process() {
+  const double unified = cgroup_quota("/sys/fs/cgroup", cgroup_path(""));
+  const double cpu = cgroup_quota("/sys/fs/cgroup/cpu", cgroup_path("cpu"));
+  return unified > 0 && cpu > 0 ? std::min(unified, cpu) : std::max(unified, cpu);
 }
 
 }  // namespace
 
-int available_threads(std::string* reason) {
-  int threads = affinity_threads();
-  std::string why = "the CPUs this process may run on";
-  const double quota = cgroup_quota();
-  if (quota > 0 && std::floor(quota) < threads) {
-    threads = std::max(1, static_cast<int>(std::floor(quota)));
-    why = "the control group's CPU quota";
+double cgroup_quota(const std::string& root, std::string group) {
+  double tightest = 0;
+  while (true) {
+    const double quota = quota_of(root + group);
+    if (quota > 0 && (tightest == 0 || quota < tightest)) tightest = quota;
+    const auto slash = group.rfind('/');
+    if (slash == std::string::npos || group.empty()) return tightest;
+    group.resize(slash);
   }
-  if (reason) *reason = why;
+}
+
+int threads_within(int affinity, double quota) {
+  if (!(quota > 0) || std::floor(quota) >= affinity) return std::max(1, affinity);
+  return std::max(1, static_cast<int>(std::floor(quota)));
+}
+
+int available_threads(std::string* reason) {
+  const int affinity = affinity_threads();
+  const int threads = threads_within(affinity, quota_of_process());
+  if (reason)
+    *reason =
+        threads < affinity ? "the control group's CPU quota" : "the CPUs this process may run on";
   return threads;
 }
 
@@ -111,7 +120,28 @@ struct Context::Threads {
     if (n > tbb::this_task_arena::max_concurrency())
       more_than_cpus.emplace(tbb::global_control::max_allowed_parallelism,
                              static_cast<std::size_t>(n));
+    start_workers(n);
   }
+
+  // oneTBB starts a worker and allocates for it when it first finds work, which may be late on a
+  // busy machine: here every place in the arena is held until all are taken. Where threads cannot
+  // be had in time, the work goes on with those there are.
+  void start_workers(int n) {
+    if (n < 2) return;
+    using Clock = std::chrono::steady_clock;
+    const auto deadline = Clock::now() + std::chrono::milliseconds(200);
+    std::atomic<int> arrived{0};
+    arena.execute([&] {
+      tbb::parallel_for(
+          tbb::blocked_range<int>(0, n, 1),
+          [&](const tbb::blocked_range<int>& range) {
+            arrived += static_cast<int>(range.size());
+            while (arrived < n && Clock::now() < deadline) std::this_thread::yield();
+          },
+          tbb::simple_partitioner());
+    });
+  }
+
   std::optional<tbb::global_control> more_than_cpus;
   tbb::task_arena arena;
   std::array<HandOver, kMaxThreads> workers;  // from one thread in a worker's place to the next

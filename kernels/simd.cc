@@ -4,6 +4,8 @@
 #include <hwy/highway.h>
 #include <hwy/targets.h>
 
+#include "lvggt/core/error.h"
+
 namespace lvggt {
 
 namespace {
@@ -23,6 +25,20 @@ std::vector<std::string> simd_targets() {
   for (const std::int64_t target : hwy::SupportedAndGeneratedTargets())
     names.push_back(name_of(target));
   return names;
+}
+
+void use_simd_target(std::string_view name) {
+  std::string all;
+  std::int64_t better = 0;  // targets before it in the list
+  for (const std::int64_t target : hwy::SupportedAndGeneratedTargets()) {
+    if (name_of(target) == name) {
+      hwy::DisableTargets(better);
+      return;
+    }
+    better |= target;
+    all += (all.empty() ? "" : ", ") + name_of(target);
+  }
+  fail(ErrorKind::kUsage, "instruction set '", name, "' is none of those of this CPU: ", all);
 }
 
 std::string simd_target() { return simd_targets().front(); }

@@ -71,6 +71,8 @@ TEST_CASE(
   CHECK(policy.of_weight("aggregator.patch_embed.blocks.0.mlp.fc1.weight") == Storage::kI8);
   CHECK(policy.of_weight("aggregator.global_blocks.3.attn.qkv") == Storage::kI8);
   CHECK(policy.of_weight("aggregator.patch_embed.patch_embed.proj.weight") == Storage::kBf16);
+  CHECK(policy.of_weight("aggregator.patch_embed.blocks.1.attn.proj.weight") == Storage::kBf16);
+  CHECK(policy.of_weight("aggregator.frame_blocks.1.attn.proj.weight") == Storage::kI8);
   CHECK(policy.of_weight("camera_head.trunk.0.attn.qkv.weight") == Storage::kBf16);
   CHECK(policy.of_weight("camera_head.pose_branch.fc1.weight") == Storage::kBf16);
   CHECK(policy.of_weight("depth_head.projects.0.weight") == Storage::kBf16);

@@ -12,6 +12,7 @@
 #include "lvggt/model/quantized_linear.h"
 #include "tests/support/child_process.h"
 #include "tests/support/tiny_model.h"
+#include "weights/sensitivity.h"
 
 using namespace lvggt;
 using namespace lvggt::test;
@@ -186,4 +187,28 @@ TEST_CASE("quantised files: the other programs say what they are and what become
   const Result widened = check({"--weights-storage", "f32"});
   CHECK(widened.status == 0);
   CHECK(contains(widened.err, "does not bring back what rounding took"));
+}
+
+TEST_CASE("measure_sensitivity: one kind at a time, and the model is whole again for the next") {
+  const Source source;
+  LoadOptions load;
+  load.weights = source.model;
+  Context ctx(2);
+  SensitivityOptions options;
+  options.frames = 1;
+  options.kinds = {"global.fc2", "patch_embed", "decoder.dpt"};
+  const auto together = measure_sensitivity(load, options, ctx);
+  REQUIRE(together.size() == 4);  // convolutions have no int8
+  CHECK(together[0].what == "global.fc2");
+  CHECK(together[1].weights == Storage::kI8);
+  CHECK(together[1].relative_l2[1] > together[0].relative_l2[1]);
+  CHECK(together[0].relative_l2[1] > 0);
+  CHECK(together[3].relative_l2[1] == 0);  // the decoder has no say in the depth
+  CHECK(together[3].relative_l2[2] > 0);
+  options.kinds = {"decoder.dpt"};
+  const auto alone = measure_sensitivity(load, options, ctx);
+  REQUIRE(alone.size() == 1);
+  CHECK(alone[0].relative_l2 == together[3].relative_l2);
+  options.kinds = {"fc2"};
+  CHECK_THROWS_WITH_AS(measure_sensitivity(load, options, ctx), doctest::Contains("'fc2'"), Error);
 }

@@ -27,11 +27,24 @@ inline std::int64_t largest_that_fits(const MemoryKnob& knob, std::size_t limit)
   return knob.low + fits * knob.step;
 }
 
-// Throws kMemory, with what would fit, when a run needs more than it may have.
+// Options of another kind that need less memory, and what a run with them would need.
+struct MemoryChoice {
+  std::string options;
+  std::size_t bytes = 0;
+};
+
+// Throws kMemory, with what would fit, when a run needs more than it may have: of the choices, the
+// first that does, so they begin with the mildest.
 inline void check_memory(std::size_t needed, const MemoryLimit& limit, const std::string& breakdown,
-                         const std::vector<MemoryKnob>& knobs) {
+                         const std::vector<MemoryKnob>& knobs,
+                         const std::vector<MemoryChoice>& choices = {}) {
   if (needed <= limit.bytes) return;
   std::string advice;
+  for (const MemoryChoice& choice : choices) {
+    if (choice.bytes > limit.bytes) continue;
+    advice = "; " + choice.options;
+    break;
+  }
   for (const MemoryKnob& knob : knobs) {
     const std::int64_t value = largest_that_fits(knob, limit.bytes);
     if (value < knob.low) continue;

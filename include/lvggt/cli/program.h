@@ -11,6 +11,7 @@
 #include <csignal>
 #include <cstdint>
 #include <cstdio>
+#include <cstdlib>
 #include <exception>
 #include <functional>
 #include <limits>
@@ -22,6 +23,7 @@
 #include <vector>
 
 #include "lvggt/core/error.h"
+#include "lvggt/core/simd.h"
 
 namespace lvggt::cli {
 
@@ -143,7 +145,11 @@ class Program {
     } catch (const std::exception& error) {
       return report(error.what(), exit_code(ErrorKind::kUsage));
     }
-    return guarded(body);
+    return guarded([&] {
+      // For comparing instruction sets, and for finding out what another CPU would do.
+      if (const char* target = std::getenv("LVGGT_SIMD")) use_simd_target(target);
+      return body();
+    });
   }
 
  private:

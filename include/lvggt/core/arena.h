@@ -6,14 +6,16 @@
 #include <cstdint>
 #include <vector>
 
+#include "lvggt/core/reserved_memory.h"
 #include "lvggt/core/tensor.h"
 
 namespace lvggt {
 
 // Scratch memory handed out by bumping an offset and taken back as a whole when a Scope ends. It
-// grows on first use; when the outermost scope ends the blocks are merged into one as large as the
-// peak, so that the same work done again does not touch the heap. Not thread-safe: one arena
-// belongs to one caller.
+// lies in address space reserved with room to grow, of which only what was handed out is ever
+// committed. Where there is no such room it grows block by block; when the outermost scope ends the
+// blocks are merged into one as large as the peak. Either way the same work done again does not
+// touch the heap. Not thread-safe: one arena belongs to one caller.
 class Arena {
  public:
   Arena() = default;
@@ -68,7 +70,7 @@ class Arena {
       std::size_t total = 0;
       for (const auto& block : blocks_) total += block.num_bytes();
       const std::size_t size = std::max({bytes, total / 2, kMinBlock});
-      blocks_.emplace_back(Shape{static_cast<std::int64_t>(size)});
+      blocks_.push_back(blocks_.empty() ? reserve_with_room(size) : ReservedMemory(size));
       used_ = 0;
     }
     std::byte* p = blocks_[block_].data() + used_;
@@ -81,11 +83,11 @@ class Arena {
   void merge() {
     if (blocks_.size() < 2) return;
     blocks_.clear();
-    blocks_.emplace_back(Shape{static_cast<std::int64_t>(peak_)});
+    blocks_.emplace_back(peak_);
   }
 
   static constexpr std::size_t kMinBlock = std::size_t{1} << 20;
-  std::vector<Tensor<std::byte, 1>> blocks_;
+  std::vector<ReservedMemory> blocks_;
   std::size_t block_ = 0;  // current block and the bytes used in it
   std::size_t used_ = 0;
   std::size_t live_ = 0;  // bytes handed out, without the unused ends of earlier blocks

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <string>
+#include <string_view>
 #include <vector>
 
 namespace lvggt {
@@ -12,5 +13,10 @@ std::string simd_target();
 
 // All instruction sets that were compiled and that this CPU has, best first.
 std::vector<std::string> simd_targets();
+
+// Makes the kernels run on the instruction set of that name, one of simd_targets(), in the whole
+// process: to compare them, or to see what another CPU would do. Before anything runs; a kUsage
+// error for another name.
+void use_simd_target(std::string_view name);
 
 }  // namespace lvggt

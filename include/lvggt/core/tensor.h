@@ -12,6 +12,7 @@
 #include <utility>
 
 #include "lvggt/core/error.h"
+#include "lvggt/core/reserved_memory.h"
 #include "lvggt/core/shape.h"
 
 namespace lvggt {
@@ -122,6 +123,7 @@ class Tensor {
       LVGGT_CHECK(extent >= 0, "tensor: shape ", shape, " has a negative extent");
     const std::size_t bytes = std::max<std::size_t>(num_bytes(), 1);
     data_.reset(static_cast<T*>(::operator new (bytes, std::align_val_t{kAlignment})));
+    if (bytes >= kHugeMemory) advise_huge_pages(data_.get(), bytes);
     std::memset(static_cast<void*>(data_.get()), 0, num_bytes());
   }
   Tensor(Tensor&& other) noexcept

@@ -43,9 +43,14 @@ class LangVggt {
   // What was odd about the weights but did not stop the loading, one sentence each.
   const std::vector<std::string>& warnings() const { return warnings_; }
 
-  // The modules, for programs that run them one by one.
+  // The modules, for programs that run them one by one, or change them while no stream runs.
   const StreamVggt& geometry() const { return geometry_; }
+  StreamVggt& geometry() { return geometry_; }
   const SemanticBridgingDecoder& decoder() const {
+    LVGGT_CHECK(has_decoder(), "model: no decoder was loaded");
+    return *decoder_;
+  }
+  SemanticBridgingDecoder& decoder() {
     LVGGT_CHECK(has_decoder(), "model: no decoder was loaded");
     return *decoder_;
   }

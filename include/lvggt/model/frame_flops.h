@@ -1,11 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <array>
+#include <cstddef>
 #include <cstdint>
 
 #include "lvggt/model/config.h"
 
-namespace lvggt::bench {
+namespace lvggt {
 
 // Floating-point operations of products, attention and convolutions in one streamed frame, by
 // stage; a multiply-add is two. Everything else is left out.
@@ -91,4 +93,4 @@ inline FrameFlops frame_flops(const ModelConfig& c, std::int64_t H, std::int64_t
   return flops;
 }
 
-}  // namespace lvggt::bench
+}  // namespace lvggt
