@@ -41,9 +41,10 @@ Complex loss(const Layer& layer, const Tensor<Complex, 2>& x, const Tensor<Compl
 
 TEST_CASE("layer_norm_backward: agrees with the complex step, with and without affine part") {
   Context ctx(2);
-  for (const auto& [N, C] : {std::pair{1, 1}, {3, 2}, {5, 7}, {2, 16}, {4, 35}, {1, 70}}) {
-    CAPTURE(C);
-    const Layer layer(N, C);
+  for (const auto& size :
+       {Shape{1, 1}, Shape{3, 2}, Shape{5, 7}, Shape{2, 16}, Shape{4, 35}, Shape{1, 70}}) {
+    CAPTURE(size);
+    const Layer layer(size[0], size[1]);
     const auto x = in_complex(layer.x);
     const auto gamma = in_complex(layer.gamma), beta = in_complex(layer.beta);
     Tensor<Complex, 1> ones(gamma.shape());
