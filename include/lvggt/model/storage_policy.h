@@ -58,7 +58,9 @@ struct StoragePolicy {
   static constexpr StoragePolicy of(Storage storage) {
     StoragePolicy policy;
     for (std::size_t i = 0; i < kUnetKind; ++i)
-      policy.kinds[i] = storage == Storage::kI8 && i >= kFirstCameraKind ? Storage::kBf16 : storage;
+      policy.kinds[i] = storage == Storage::kI8 && (i == kDinoProjKind || i >= kFirstCameraKind)
+                            ? Storage::kBf16
+                            : storage;
     return policy;
   }
 
