@@ -46,12 +46,12 @@ inline Input open_input(const LiftOptions& options) {
 // and of the contact sheet, and the decoding of the original.
 inline std::size_t program_bytes(const ImageTransform& transform, std::int64_t levels,
                                  std::int64_t lang_dim) {
-  constexpr std::size_t kCode = std::size_t{24} << 20;
+  constexpr std::size_t kCode = std::size_t{20} << 20;
   const auto pixels =
       static_cast<std::size_t>(transform.width) * static_cast<std::size_t>(transform.height);
   const auto original = static_cast<std::size_t>(transform.original_width) *
                         static_cast<std::size_t>(transform.original_height);
-  const auto semantics = static_cast<std::size_t>(levels * (4 * lang_dim + 3));
+  const auto semantics = static_cast<std::size_t>(levels * (4 * lang_dim + 3));  // 0 levels: none
   // Before the first video of a list: later ones find the model there.
   static const std::size_t process = cli::resident_bytes();
   return process + kCode + pixels * (80 + semantics) + original * 24;
@@ -86,7 +86,8 @@ inline Plan plan_run(const Checkpoint& checkpoint, const LiftOptions& options,
     plan.model.total += weights - plan.model.weights;
     plan.model.weights = weights;
   }
-  plan.total = plan.model.total + program_bytes(transform, checkpoint.config().sbd_levels,
+  plan.total = plan.model.total + program_bytes(transform,
+                                                stream.decoder ? checkpoint.config().sbd_levels : 0,
                                                 checkpoint.config().lang_dim);
   return plan;
 }

@@ -328,8 +328,8 @@ TEST_CASE("plan_memory: 128 past frames of 294 x 518 in an int8 cache take at mo
   StreamOptions options;
   options.cache_storage = Storage::kI8;
   const MemoryPlan plan = plan_memory(ModelConfig{}, 294, 518, options);
-  CHECK(plan.cache == 129u * (24u * (2u * 784u * 1024u + 2u * 16u * 784u * 4u) +
-                              4u * 2u * 16u * 16u * 128u * 4u));
+  CHECK(plan.cache == std::size_t{129} * (24u * (2u * 784u * 1024u + 2u * 16u * 784u * 4u) +
+                                          4u * 2u * 16u * 16u * 128u * 4u));
   CHECK(static_cast<double>(plan.cache) <= 5.2 * 0x1p30);
 }
 

@@ -24,6 +24,24 @@ inline std::string without_trailing_slashes(std::string path) {
   return path;
 }
 
+// Whether `name` is one that a file has while it is written (io/atomic_file.h): ".NAME.TAG.tmp"
+// with 16 hexadecimal digits.
+inline bool is_temporary_file(const std::string& name) {
+  constexpr std::size_t kTag = 16, kEnd = 4;  // ".tmp"
+  if (name.size() < kTag + kEnd + 3 || name.front() != '.' || !name.ends_with(".tmp")) return false;
+  const std::string tag = name.substr(name.size() - kTag - kEnd, kTag);
+  return name[name.size() - kTag - kEnd - 1] == '.' &&
+         tag.find_first_not_of("0123456789abcdef") == std::string::npos;
+}
+
+// Whether a folder holds anything but the unfinished files of a killed run.
+inline bool holds_anything(const std::string& path) {
+  std::error_code error;
+  for (const auto& entry : std::filesystem::directory_iterator(path, error))
+    if (!is_temporary_file(entry.path().filename().string())) return true;
+  return false;
+}
+
 // Checks, before any long work and without changing anything, that `path` can become the output
 // folder: it is there or its parent is, it can be written, and it is empty, or holds an earlier run
 // (run.json) that may be replaced or resumed. Returns whether it holds an earlier run. Errors:
@@ -49,7 +67,7 @@ inline bool check_output_folder(const std::string& path, Existing existing) {
     fail(ErrorKind::kWrite, path, ": is a file, but the output is a folder");
   if (access(path.c_str(), W_OK | X_OK) != 0)
     fail(ErrorKind::kWrite, path, ": the folder is not writable");
-  if (fs::is_empty(path, error)) return false;
+  if (!holds_anything(path)) return false;
   if (!fs::exists(path + "/" + kRunFile, error))
     fail(ErrorKind::kUsage, path, ": the folder is not empty and holds no earlier run (", kRunFile,
          "); choose another one");
@@ -71,6 +89,26 @@ inline bool is_numbered_file(const std::string& name, const std::vector<std::str
   const std::size_t digits = name.find_first_not_of("0123456789");
   if (digits == 0 || digits == std::string::npos) return false;
   return std::find(endings.begin(), endings.end(), name.substr(digits)) != endings.end();
+}
+
+// Removes the unfinished files that a killed run left in `path` and its `folders`. Only for a
+// folder that nobody else is writing to. Errors: kWrite.
+inline void remove_unfinished_files(const std::string& path,
+                                    const std::vector<std::string>& folders) {
+  namespace fs = std::filesystem;
+  std::vector<fs::path> places{path};
+  for (const std::string& folder : folders) places.push_back(fs::path(path) / folder);
+  std::vector<fs::path> unfinished;
+  for (const fs::path& place : places) {
+    std::error_code missing;
+    for (const auto& entry : fs::directory_iterator(place, missing))
+      if (is_temporary_file(entry.path().filename().string())) unfinished.push_back(entry.path());
+  }
+  for (const fs::path& file : unfinished) {
+    std::error_code error;
+    if (!fs::remove(file, error) && error)
+      fail(ErrorKind::kWrite, file.string(), ": cannot be removed: ", error.message());
+  }
 }
 
 // Removes what an earlier run left: `files`, and in `folders` the files named by a number, with the
