@@ -44,17 +44,24 @@ inline Input open_input(const LiftOptions& options) {
 // Memory beside the model's: what this process holds by now (its libraries, the decoder of the
 // video, the first frame), the code it has yet to touch, the point cloud, the pictures of a frame
 // and of the contact sheet, and the decoding of the original.
-inline std::size_t program_bytes(const ImageTransform& transform, std::int64_t levels,
-                                 std::int64_t lang_dim) {
+inline std::size_t program_bytes(const ImageTransform& transform, std::size_t frames,
+                                 std::int64_t levels, std::int64_t lang_dim) {
   constexpr std::size_t kCode = std::size_t{20} << 20;
-  const auto pixels =
-      static_cast<std::size_t>(transform.width) * static_cast<std::size_t>(transform.height);
+  const auto width = static_cast<std::size_t>(transform.width);
+  const auto height = static_cast<std::size_t>(transform.height);
+  const std::size_t pixels = width * height;
   const auto original = static_cast<std::size_t>(transform.original_width) *
                         static_cast<std::size_t>(transform.original_height);
   const auto semantics = static_cast<std::size_t>(levels * (4 * lang_dim + 3));  // 0 levels: none
+  // The contact sheet keeps up to 16 frames, each with four pictures and the levels.
+  constexpr std::size_t kSheetFrames = 16, kSheetCellWidth = 176;
+  const std::size_t cell_width = std::min<std::size_t>(width, kSheetCellWidth);
+  const std::size_t cell = cell_width * (cell_width * height / width + 1) * 3;
+  const std::size_t sheet =
+      std::min(frames, kSheetFrames) * (4 + static_cast<std::size_t>(levels)) * cell;
   // Before the first video of a list: later ones find the model there.
   static const std::size_t process = cli::resident_bytes();
-  return process + kCode + pixels * (80 + semantics) + original * 24;
+  return process + kCode + pixels * (80 + semantics) + original * 24 + sheet;
 }
 
 struct Plan {
@@ -66,7 +73,8 @@ struct Plan {
 using PlanOf = std::function<std::size_t(const LiftOptions&)>;
 
 inline Plan plan_run(const Checkpoint& checkpoint, const LiftOptions& options,
-                     const ImageTransform& transform, std::int64_t past_frames) {
+                     const ImageTransform& transform, std::int64_t past_frames,
+                     std::size_t num_frames) {
   StreamOptions stream = options.stream;
   stream.max_past_frames = past_frames;
   stream.decoder = stream.decoder && checkpoint.has_decoder();
@@ -86,10 +94,16 @@ inline Plan plan_run(const Checkpoint& checkpoint, const LiftOptions& options,
     plan.model.total += weights - plan.model.weights;
     plan.model.weights = weights;
   }
-  plan.total = plan.model.total + program_bytes(transform,
+  plan.total = plan.model.total + program_bytes(transform, num_frames,
                                                 stream.decoder ? checkpoint.config().sbd_levels : 0,
                                                 checkpoint.config().lang_dim);
   return plan;
+}
+
+// Frames of the run; many where the input does not tell.
+inline std::size_t num_frames(const Input& input) {
+  const std::int64_t expected = input.source->expected_frames();
+  return static_cast<std::size_t>(expected > 0 ? expected : kMaxPastFrames);
 }
 
 // Past frames that the last frame of this run can see.
@@ -142,7 +156,7 @@ inline void check_plan(const Plan& plan, const Checkpoint& checkpoint, const Lif
   const std::int64_t past = reachable_past_frames(options, input);
   const auto total = [&](const LiftOptions& changed, const ImageTransform& transform,
                          std::int64_t frames) {
-    return plan_run(checkpoint, changed, transform, frames).total;
+    return plan_run(checkpoint, changed, transform, frames, num_frames(input)).total;
   };
   std::vector<cli::MemoryKnob> knobs;
   knobs.push_back({"--max-past-frames", 1, std::max<std::int64_t>(past, 1), 1,

@@ -278,8 +278,8 @@ int lift_one(const LiftOptions& options, SharedModel& shared, const cli::Interru
   const Checkpoint& checkpoint = shared.checkpoint();
   const cli::ThreadChoice& threads = shared.threads();
   Input input = open_input(options);
-  const Plan plan =
-      plan_run(checkpoint, options, input.transform, reachable_past_frames(options, input));
+  const Plan plan = plan_run(checkpoint, options, input.transform,
+                             reachable_past_frames(options, input), num_frames(input));
   if (options.dry_run) print_plan(options, input, plan, checkpoint, threads);
   check_plan(plan, checkpoint, options, input);
   if (options.dry_run) {
