@@ -140,8 +140,7 @@ class Lift {
       cli::remove_earlier_run(options_.out, {cli::kRunFile}, {});
     }
     cli::create_output_folder(options_.out);
-    if (options_.force || options_.resume)
-      cli::remove_unfinished_files(options_.out, run_folders());
+    if (options_.force || options_.resume) cli::remove_unfinished_files(options_.out);
     write_file(options_.out + "/" + cli::kRunFile, run_json(record_));
     writer_.emplace(options_.out, options_.outputs, format_, options_.resume);
   }

@@ -262,7 +262,7 @@ int make_tokens(const MakeTokensOptions& options, const std::string& path, const
   Run run(options, out, input, manifest, encoder, record, interrupt);
   if (existed && earlier == Earlier::kReplace) remove_tokens(out);
   cli::create_output_folder(out);
-  if (earlier != Earlier::kRefuse) cli::remove_unfinished_files(out, {});
+  if (earlier != Earlier::kRefuse) cli::remove_unfinished_files(out);
   write_file(out + "/" + cli::kRunFile, run_json(record));
   write_file(manifest_file, to_json(manifest));
   try {

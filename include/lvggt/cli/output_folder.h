@@ -91,21 +91,15 @@ inline bool is_numbered_file(const std::string& name, const std::vector<std::str
   return std::find(endings.begin(), endings.end(), name.substr(digits)) != endings.end();
 }
 
-// Removes the unfinished files that a killed run left in `path` and its `folders`. Only for a
+// Removes the unfinished files that a killed run left in `path` and the folders inside. Only for a
 // folder that nobody else is writing to. Errors: kWrite.
-inline void remove_unfinished_files(const std::string& path,
-                                    const std::vector<std::string>& folders) {
+inline void remove_unfinished_files(const std::string& path) {
   namespace fs = std::filesystem;
-  std::vector<fs::path> places{path};
-  for (const std::string& folder : folders) places.push_back(fs::path(path) / folder);
   std::vector<fs::path> unfinished;
-  for (const fs::path& place : places) {
-    std::error_code missing;
-    for (const auto& entry : fs::directory_iterator(place, missing))
-      if (is_temporary_file(entry.path().filename().string())) unfinished.push_back(entry.path());
-  }
+  std::error_code error;
+  for (const auto& entry : fs::recursive_directory_iterator(path, error))
+    if (is_temporary_file(entry.path().filename().string())) unfinished.push_back(entry.path());
   for (const fs::path& file : unfinished) {
-    std::error_code error;
     if (!fs::remove(file, error) && error)
       fail(ErrorKind::kWrite, file.string(), ": cannot be removed: ", error.message());
   }
