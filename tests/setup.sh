@@ -9,6 +9,7 @@ packages=(
   libpng-dev libstb-dev libexif-dev libzip-dev            # pictures, .pth archives
   libssl-dev                                              # SHA-256
   libavformat-dev libavcodec-dev libavutil-dev libswscale-dev
+  libicu-dev libgumbo-dev libsentencepiece-dev zlib1g-dev # phrases and sentences
   libopenmpi-dev openmpi-bin                              # training on several machines
   libcli11-dev doctest-dev libbenchmark-dev
 )
