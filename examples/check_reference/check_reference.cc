@@ -4,6 +4,7 @@
 #include <string>
 
 #include "examples/check_reference/cases.h"
+#include "examples/check_reference/encoder_cases.h"
 #include "lvggt/cli/program.h"
 
 namespace {
@@ -14,6 +15,7 @@ struct Options {
   LoadOptions load;
   std::string case_file;
   std::string inputs;
+  std::string vocabulary;
   std::string weights_storage = "stored", cache_storage = "f32";
   double tolerance = 2e-4;
   int threads = 0;
@@ -41,16 +43,24 @@ void run_case(const std::string& name, check_reference::Comparison& comparison,
               const Options& options, Context& ctx) {
   if (name == "ops") return check_reference::check_ops(comparison, ctx);
   if (name == "preprocess") return check_reference::check_preprocess(comparison);
+  if (name == "crops") return check_reference::check_crops(comparison);
   const bool training = name.starts_with("train");
   const bool streamed = name.starts_with("stream") || name == "evict" || name == "full_size";
   const bool bidirectional = name == "vggt";
-  if (!training && !streamed && !bidirectional && name != "batch" && name != "square")
+  const bool encoder = name == "clip" || name == "mistral";
+  if (!training && !streamed && !bidirectional && !encoder && name != "batch" && name != "square")
     fail(ErrorKind::kUnsupported, comparison.file().path(), ": case \"", name,
          "\" is not one of stream, ",
          "stream_lang6, evict, batch, square, vggt, ops, preprocess, full_size, train, "
-         "train_small, train_upstream_cos");
+         "train_small, train_upstream_cos, clip, mistral, crops");
   if (options.load.weights.empty())
     fail(ErrorKind::kUsage, "--weights is required for the case \"", name, "\"");
+  if (name == "clip")
+    return check_reference::check_clip_towers(comparison, options.load.weights, options.load.config,
+                                              ctx);
+  if (name == "mistral")
+    return check_reference::check_mistral(comparison, options.load.weights, options.load.config,
+                                          ctx);
   if (training)
     return check_reference::check_train(comparison, name, options.load, options.inputs, ctx);
   LoadOptions load = options.load;
@@ -66,7 +76,20 @@ void run_case(const std::string& name, check_reference::Comparison& comparison,
   }
 }
 
+// Cases that are JSON have no metadata: their content tells them apart.
+int check_json(const Options& options) {
+  const Json json = Json::read(options.case_file);
+  if (!check_reference::is_tokenizer_case(json))
+    fail(ErrorKind::kUnsupported, options.case_file, ": is none of the JSON cases: tokenizer");
+  if (options.vocabulary.empty())
+    fail(ErrorKind::kUsage, "--vocabulary is required for the case \"tokenizer\"");
+  return check_reference::check_tokenizer(json, options.case_file, options.vocabulary, options.json)
+             ? 0
+             : 1;
+}
+
 int check(const Options& options) {
+  if (options.case_file.ends_with(".json")) return check_json(options);
   const Safetensors file = Safetensors::open(options.case_file);
   const std::string name = case_of(file);
   if (name == "autoencoder") {
@@ -99,7 +122,7 @@ int main(int argc, char** argv) {
       "|ours - ref| / |ref| by Euclidean norms. Those cases have limits of their own.",
       LVGGT_VERSION);
   auto& app = program.app();
-  app.add_option("case", options.case_file, "Reference file (safetensors)")
+  app.add_option("case", options.case_file, "Reference file (safetensors; JSON for the tokenizer)")
       ->required()
       ->type_name("CASE");
   app.add_option("--inputs", options.inputs,
@@ -113,6 +136,10 @@ int main(int argc, char** argv) {
   app.add_option("--config", options.load.config,
                  "Configuration (JSON); else the weights' metadata or shapes tell it")
       ->type_name("FILE");
+  app.add_option("--vocabulary", options.vocabulary,
+                 "Folder of CLIP's vocabulary (merges.txt and vocab.json, or tokenizer.json), for "
+                 "the tokenizer case")
+      ->type_name("DIR");
   app.add_option("--weights-storage", options.weights_storage,
                  "How weights are kept: stored (as in their file), f32, bf16, f16 or int8 (linear "
                  "layers of the transformer)")
