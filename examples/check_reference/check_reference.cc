@@ -5,6 +5,7 @@
 
 #include "examples/check_reference/cases.h"
 #include "examples/check_reference/encoder_cases.h"
+#include "examples/check_reference/query_cases.h"
 #include "lvggt/cli/program.h"
 
 namespace {
@@ -44,6 +45,10 @@ void run_case(const std::string& name, check_reference::Comparison& comparison,
   if (name == "ops") return check_reference::check_ops(comparison, ctx);
   if (name == "preprocess") return check_reference::check_preprocess(comparison);
   if (name == "crops") return check_reference::check_crops(comparison);
+  if (name == "autoencoder") return check_reference::check_autoencoder(comparison, ctx);
+  if (name == "query") return check_reference::check_query(comparison, ctx);
+  if (name == "polygons") return check_reference::check_polygons(comparison);
+  if (name == "timeseries") return check_reference::check_timeseries(comparison, ctx);
   const bool training = name.starts_with("train");
   const bool streamed = name.starts_with("stream") || name == "evict" || name == "full_size";
   const bool bidirectional = name == "vggt";
@@ -52,7 +57,8 @@ void run_case(const std::string& name, check_reference::Comparison& comparison,
     fail(ErrorKind::kUnsupported, comparison.file().path(), ": case \"", name,
          "\" is not one of stream, ",
          "stream_lang6, evict, batch, square, vggt, ops, preprocess, full_size, train, "
-         "train_small, train_upstream_cos, clip, mistral, crops");
+         "train_small, train_upstream_cos, clip, mistral, crops, autoencoder, query, polygons, "
+         "timeseries");
   if (options.load.weights.empty())
     fail(ErrorKind::kUsage, "--weights is required for the case \"", name, "\"");
   if (name == "clip")
@@ -92,13 +98,6 @@ int check(const Options& options) {
   if (options.case_file.ends_with(".json")) return check_json(options);
   const Safetensors file = Safetensors::open(options.case_file);
   const std::string name = case_of(file);
-  if (name == "autoencoder") {
-    std::fprintf(
-        stderr,
-        "check_reference: %s: the case \"%s\" is about training, which is not supported yet\n",
-        file.path().c_str(), name.c_str());
-    return 1;
-  }
   Context ctx(options.threads);
   check_reference::Comparison comparison(file, options.tolerance);
   run_case(name, comparison, options, ctx);

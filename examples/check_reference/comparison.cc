@@ -169,6 +169,31 @@ void Comparison::compare(const std::string& name, const std::vector<std::int64_t
   lines_.push_back(std::move(line));
 }
 
+void Comparison::compare_masks(const std::string& name, const std::uint8_t* values,
+                               std::int64_t size, std::int64_t pixels, std::int64_t wrong) {
+  if (!wants(name) || !seen_.insert(name).second) return;
+  const std::vector<std::int64_t> expected = file_.read_int64(name);
+  if (static_cast<std::int64_t>(expected.size()) != size) {
+    add_failure(name, "has " + std::to_string(size) + " values where the reference has " +
+                          std::to_string(expected.size()));
+    return;
+  }
+  std::int64_t most = 0, differing = 0;
+  for (std::int64_t i = 0; i < size; ++i) {
+    if (i % pixels == 0) differing = 0;
+    differing += expected[static_cast<std::size_t>(i)] != values[i];
+    most = std::max(most, differing);
+  }
+  const auto count = static_cast<double>(most);
+  Line line{name, count, count / static_cast<double>(pixels), 0, Verdict::kOk, {}, Measure::kMax};
+  if (most > wrong) {
+    line.verdict = Verdict::kFail;
+    line.note = std::to_string(most) + " pixels of one mask differ";
+  }
+  ok_ = ok_ && line.verdict == Verdict::kOk;
+  lines_.push_back(std::move(line));
+}
+
 void Comparison::judge(const std::string& name, std::span<const float> ours,
                        std::span<const float> expected, double tolerance, Measure measure) {
   Line line{name, 0, 0, 0, Verdict::kOk, {}, Measure::kMax};

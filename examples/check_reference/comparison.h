@@ -32,6 +32,10 @@ class Comparison {
   }
   void compare(const std::string& name, const std::vector<std::int64_t>& values);
 
+  // Masks of 0 and 1, one after the other: at most `wrong` of every `pixels` values may differ.
+  void compare_masks(const std::string& name, const std::uint8_t* values, std::int64_t size,
+                     std::int64_t pixels, std::int64_t wrong);
+
   // The same with a limit of its own for rel_err.
   void compare_within(const std::string& name, std::span<const float> values, double tolerance);
 

@@ -46,20 +46,29 @@ void Relevancy::run_group(View<float, 2> relevancy, View<const float, 2> codes, 
     Arena::Scope scope(ctx.arena());
     const View<float, 2> cosines = ctx.arena().alloc(Shape{end - begin, vectors.count()});
     decoder_.cosines(cosines, codes.narrow(0, begin, end), vectors, ctx);
-    parallel_rows(
-        end - begin, kernels::rows_per_chunk(vectors.count()),
-        [&](std::int64_t first, std::int64_t last) {
-          for (std::int64_t i = first; i < last; ++i) {
-            const float* row = cosines.data() + i * cosines.stride(0);
-            const float nearest = *std::max_element(row, row + C);
-            float* out = relevancy.data() + begin + i;
-            for (std::int64_t j = 0; j < n; ++j)
-              out[j * relevancy.stride(0)] =
-                  1 / (1 + std::exp(kRelevancyScale * (nearest - row[C + j])));
-          }
-        },
-        ctx);
+    relevancy_of_products(relevancy.narrow(1, begin, end), cosines, C, ctx);
   }
+}
+
+void relevancy_of_products(View<float, 2> relevancy, View<const float, 2> products,
+                           std::int64_t num_canonical, Context& ctx) {
+  const std::int64_t N = products.extent(0), n = relevancy.extent(0), C = num_canonical;
+  LVGGT_CHECK(C >= 1 && relevancy.extent(1) == N && products.extent(1) == C + n,
+              "relevancy: the maps are ", relevancy.shape(), " but the products ", products.shape(),
+              " are with ", C, " canonical phrases");
+  parallel_rows(
+      N, kernels::rows_per_chunk(C + n),
+      [&](std::int64_t begin, std::int64_t end) {
+        for (std::int64_t i = begin; i < end; ++i) {
+          const float* row = products.data() + i * products.stride(0);
+          const float nearest = *std::max_element(row, row + C);
+          float* out = relevancy.data() + i;
+          for (std::int64_t j = 0; j < n; ++j)
+            out[j * relevancy.stride(0)] =
+                1 / (1 + std::exp(kRelevancyScale * (nearest - row[C + j])));
+        }
+      },
+      ctx);
 }
 
 bool all_positive(View<const float, 4> codes) {

@@ -58,6 +58,11 @@ class Relevancy {
   std::vector<DecodedCosines::Vectors> groups_;  // canonical phrases, then the group's
 };
 
+// The same from products with the canonical phrases and the phrases that were computed elsewhere.
+//   relevancy: [n, N]   products: [N, c + n], <e, c> then <e, q>
+void relevancy_of_products(View<float, 2> relevancy, View<const float, 2> products,
+                           std::int64_t num_canonical, Context& ctx);
+
 // Whether every code is above 0. The published evaluation then takes a frame for one stored in
 // [0, 1] and decodes 2 x - 1.   codes: [levels, H, W, d]
 bool all_positive(View<const float, 4> codes);
