@@ -32,17 +32,19 @@ void append_linear(std::vector<TensorSpec>& tensors, const std::string& name, st
 
 // The outputs of the linear layers of one part, from the shapes of their weights; `input` receives
 // what the first one takes.
-std::vector<std::int64_t> infer_widths(const Safetensors& file, const std::string& prefix,
+std::vector<std::int64_t> infer_widths(std::span<const TensorSpec> tensors,
+                                       const std::string& source, const std::string& prefix,
                                        const char* part, std::int64_t& input) {
   std::vector<std::int64_t> widths;
   for (std::int64_t layer = 0;; ++layer) {
     const std::string name = prefix + linear_name(part, layer) + ".weight";
-    const TensorEntry* entry = file.find(name);
-    if (entry == nullptr) return widths;
-    LVGGT_CHECK(entry->shape.size() == 2, file.path(), ": ", name, " is ", shape_text(entry->shape),
+    const auto entry =
+        std::ranges::find_if(tensors, [&](const TensorSpec& spec) { return spec.name == name; });
+    if (entry == tensors.end()) return widths;
+    LVGGT_CHECK(entry->shape.size() == 2, source, ": ", name, " is ", shape_text(entry->shape),
                 ", not the matrix of a linear layer");
     if (layer == 0) input = entry->shape[1];
-    LVGGT_CHECK(layer == 0 || entry->shape[1] == widths.back(), file.path(), ": ", name, " is ",
+    LVGGT_CHECK(layer == 0 || entry->shape[1] == widths.back(), source, ": ", name, " is ",
                 shape_text(entry->shape), " but the layer before it has ", widths.back(),
                 " outputs");
     widths.push_back(entry->shape[0]);
@@ -167,21 +169,27 @@ std::vector<TensorSpec> autoencoder_tensors(const AutoencoderShape& shape) {
   return tensors;
 }
 
-AutoencoderShape infer_autoencoder_shape(const Safetensors& file, const std::string& prefix) {
+AutoencoderShape infer_autoencoder_shape(std::span<const TensorSpec> tensors,
+                                         const std::string& source, const std::string& prefix) {
   AutoencoderShape shape;
-  shape.decoder = infer_widths(file, prefix, "decoder", shape.code);
-  LVGGT_CHECK(!shape.decoder.empty(), file.path(), ": holds no autoencoder; there is no tensor ",
-              prefix, "decoder.0.weight");
+  shape.decoder = infer_widths(tensors, source, prefix, "decoder", shape.code);
+  LVGGT_CHECK(!shape.decoder.empty(), source, ": holds no autoencoder; there is no tensor ", prefix,
+              "decoder.0.weight");
   shape.features = shape.decoder.back();
   std::int64_t input = shape.features;
-  shape.encoder = infer_widths(file, prefix, "encoder", input);
+  shape.encoder = infer_widths(tensors, source, prefix, "encoder", input);
   LVGGT_CHECK(
       shape.encoder.empty() || (input == shape.features && shape.encoder.back() == shape.code),
-      file.path(), ": the encoder makes codes of ",
-      shape.encoder.empty() ? 0 : shape.encoder.back(), " numbers from ", input,
-      " features, but the decoder makes ", shape.features, " features from ", shape.code,
-      " numbers");
+      source, ": the encoder makes codes of ", shape.encoder.empty() ? 0 : shape.encoder.back(),
+      " numbers from ", input, " features, but the decoder makes ", shape.features,
+      " features from ", shape.code, " numbers");
   return shape;
+}
+
+AutoencoderShape infer_autoencoder_shape(const Safetensors& file, const std::string& prefix) {
+  std::vector<TensorSpec> tensors;
+  for (const TensorEntry& entry : file.entries()) tensors.push_back({entry.name, entry.shape});
+  return infer_autoencoder_shape(tensors, file.path(), prefix);
 }
 
 Autoencoder Autoencoder::load(const std::string& path) { return from(Safetensors::open(path)); }

@@ -43,6 +43,8 @@ std::vector<TensorSpec> autoencoder_tensors(const AutoencoderShape& shape);
 // only is fine: queries need no more. Errors: kMismatch when there is no such decoder or its layers
 // do not follow each other.
 AutoencoderShape infer_autoencoder_shape(const Safetensors& file, const std::string& prefix = "");
+AutoencoderShape infer_autoencoder_shape(std::span<const TensorSpec> tensors,
+                                         const std::string& source, const std::string& prefix = "");
 
 // The autoencoder in inference, immutable once loaded:
 //   encode: Linear, then [BatchNorm, ReLU, Linear] for each further width; unit length
