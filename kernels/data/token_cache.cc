@@ -63,10 +63,9 @@ std::vector<TensorSpec> encoder_tensors(const ModelConfig& config) {
   return specs;
 }
 
-}  // namespace
-
-std::string encoder_sha256(const Checkpoint& checkpoint, Context& ctx) {
-  const std::vector<TensorSpec> specs = encoder_tensors(checkpoint.config());
+// Of names, shapes and values of the tensors.
+std::string sha256_tensors(const Checkpoint& checkpoint, const std::vector<TensorSpec>& specs,
+                           Context& ctx) {
   std::vector<std::string> sums(specs.size());
   parallel_chunks(
       static_cast<std::int64_t>(specs.size()),
@@ -82,6 +81,19 @@ std::string encoder_sha256(const Checkpoint& checkpoint, Context& ctx) {
   for (std::size_t i = 0; i < specs.size(); ++i)
     text += specs[i].name + " " + shape_text(specs[i].shape) + " " + sums[i] + "\n";
   return sha256(std::as_bytes(std::span(text.data(), text.size())));
+}
+
+}  // namespace
+
+std::string encoder_sha256(const Checkpoint& checkpoint, Context& ctx) {
+  return sha256_tensors(checkpoint, encoder_tensors(checkpoint.config()), ctx);
+}
+
+std::string decoder_sha256(const Checkpoint& checkpoint, Context& ctx) {
+  std::vector<TensorSpec> specs = decoder_tensors(checkpoint.config());
+  std::sort(specs.begin(), specs.end(),
+            [](const TensorSpec& a, const TensorSpec& b) { return a.name < b.name; });
+  return sha256_tensors(checkpoint, specs, ctx);
 }
 
 std::string encoder_storage(const Checkpoint& checkpoint) {

@@ -25,14 +25,6 @@ std::string join(const std::vector<std::string>& names, std::size_t most) {
   return text;
 }
 
-constexpr std::string_view kDecoderPrefixes[] = {"feature_extractor.", "lang_encoder.",
-                                                 "lang_decoder", "rgb_encoder.", "rgb_decoder."};
-
-bool decoder_name(std::string_view name) {
-  return std::any_of(std::begin(kDecoderPrefixes), std::end(kDecoderPrefixes),
-                     [&](std::string_view prefix) { return name.starts_with(prefix); });
-}
-
 bool any_name(const Safetensors& file, bool (*predicate)(std::string_view)) {
   return std::any_of(file.entries().begin(), file.entries().end(),
                      [&](const TensorEntry& entry) { return predicate(entry.name); });
@@ -128,7 +120,7 @@ Checkpoint::Checkpoint(const LoadOptions& options)
   if (!options.decoder.empty()) decoder_ = Safetensors::open(options.decoder);
   if (!options.overrides.empty()) overrides_ = Safetensors::open(options.overrides);
   refuse_other_models();
-  has_decoder_ = decoder_.has_value() || any_name(geometry_, decoder_name);
+  has_decoder_ = decoder_.has_value() || any_name(geometry_, is_decoder_tensor);
   has_point_head_ = options.points && any_name(geometry_, point_head_name);
   settle_config(options);
   if (overrides_ && has_decoder_) {
@@ -138,12 +130,28 @@ Checkpoint::Checkpoint(const LoadOptions& options)
       config_.lang_dim = last->shape[0];
   }
 
+  check_tensors(options.strict);
+}
+
+Checkpoint::Checkpoint(const LoadOptions& options, const ModelConfig& geometry)
+    : geometry_(Safetensors::open(options.decoder)),
+      storage_(options.storage),
+      has_decoder_(true),
+      decoder_only_(true),
+      allow_nonfinite_(options.allow_nonfinite) {
+  if (!any_name(geometry_, is_decoder_tensor))
+    fail(ErrorKind::kMismatch, geometry_.path(), ": not a semantic bridging decoder: ",
+         any_name(geometry_, geometry_name) ? "it is a geometry model" : resemblance(geometry_));
+  config_ = infer_decoder_config(geometry_, geometry);
+  check_tensors(options.strict);
+}
+
+void Checkpoint::check_tensors(bool strict) {
   const std::vector<TensorSpec> expected = expected_tensors();
   Problems problems;
   check_shapes(expected, problems);
-  check_extra(expected, options.strict, problems);
+  check_extra(expected, strict, problems);
   if (!problems.empty()) report(problems);
-
   describe_storage(expected);
 }
 
@@ -201,14 +209,14 @@ Tensor<float, 2> Checkpoint::read_widened_int8(const Found& found) const {
 
 void Checkpoint::refuse_other_models() const {
   if (!any_name(geometry_, geometry_name)) {
-    if (any_name(geometry_, decoder_name))
+    if (any_name(geometry_, is_decoder_tensor))
       fail(ErrorKind::kMismatch, geometry_.path(),
            ": this is a semantic bridging decoder, not a geometry ",
            "model; give it as the decoder and the geometry model as the weights");
     fail(ErrorKind::kMismatch, geometry_.path(),
          ": not a geometry model: ", resemblance(geometry_));
   }
-  if (decoder_ && !any_name(*decoder_, decoder_name)) {
+  if (decoder_ && !any_name(*decoder_, is_decoder_tensor)) {
     if (any_name(*decoder_, geometry_name))
       fail(ErrorKind::kMismatch, decoder_->path(),
            ": this is a geometry model, not a semantic bridging ",
@@ -236,7 +244,8 @@ void Checkpoint::settle_config(const LoadOptions& options) {
 }
 
 std::vector<TensorSpec> Checkpoint::expected_tensors() const {
-  std::vector<TensorSpec> expected = geometry_tensors(config_);
+  std::vector<TensorSpec> expected;
+  if (!decoder_only_) expected = geometry_tensors(config_);
   if (has_decoder_)
     for (TensorSpec& spec : decoder_tensors(config_)) expected.push_back(std::move(spec));
   std::erase_if(expected, [&](const TensorSpec& spec) {
@@ -248,7 +257,7 @@ std::vector<TensorSpec> Checkpoint::expected_tensors() const {
 Checkpoint::Found Checkpoint::look_up(const std::string& name) const {
   if (overrides_)
     if (const TensorEntry* entry = overrides_->find("weight." + name)) return {&*overrides_, entry};
-  if (decoder_ && decoder_name(name)) return {&*decoder_, decoder_->find(name)};
+  if (decoder_ && is_decoder_tensor(name)) return {&*decoder_, decoder_->find(name)};
   return {&geometry_, geometry_.find(name)};
 }
 
@@ -282,7 +291,7 @@ void Checkpoint::check_extra(const std::vector<TensorSpec>& expected, bool stric
   const auto scan = [&](const Safetensors& file, bool takes_decoder_names) {
     for (const TensorEntry& entry : file.entries()) {
       const bool used =
-          names.contains(entry.name) && decoder_name(entry.name) == takes_decoder_names;
+          names.contains(entry.name) && is_decoder_tensor(entry.name) == takes_decoder_names;
       if (used || known_unused_tensor(entry.name) || is_scale_of_int8(file, entry.name) ||
           (skip_points_ && point_head_name(entry.name)))
         continue;
@@ -314,6 +323,7 @@ void Checkpoint::report(const Problems& problems) const {
   add(problems.missing, " tensors are missing: ");
   add(problems.misshapen, " tensors do not fit the configuration: ");
   add(problems.extra, " tensors are not part of the configuration: ");
+  if (decoder_only_) fail(ErrorKind::kMismatch, text);
   ModelConfig found = infer_config(geometry_, decoder_ ? &*decoder_ : nullptr, config_);
   // Shapes do not tell these.
   found.dino_heads = config_.dino_heads;

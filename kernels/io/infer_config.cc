@@ -115,4 +115,36 @@ ModelConfig infer_config(const Safetensors& geometry, const Safetensors* decoder
   return config;
 }
 
+ModelConfig infer_decoder_config(const Safetensors& decoder, const ModelConfig& geometry) {
+  ModelConfig config = geometry;
+  const auto metadata = decoder.metadata().find("config");
+  if (metadata == decoder.metadata().end() || !metadata->second.starts_with('{')) {
+    infer_decoder(Shapes(decoder), config);
+    validate_config(config, decoder.path() + ": the configuration that its shapes tell");
+    return config;
+  }
+  const ModelConfig own = parse_config(metadata->second, decoder.path() + ": metadata \"config\"");
+  ModelConfig same_tokens = own;
+  same_tokens.embed_dim = geometry.embed_dim;
+  same_tokens.patch_size = geometry.patch_size;
+  same_tokens.dino_depth = geometry.dino_depth;
+  same_tokens.agg_depth = geometry.agg_depth;
+  same_tokens.taps = geometry.taps;
+  if (!(same_tokens == own))
+    fail(ErrorKind::kMismatch, decoder.path(), ": was made for another geometry model: its ",
+         config_difference(own, same_tokens));
+  config.dpt_ln_eps = own.dpt_ln_eps;
+  config.sbd_features = own.sbd_features;
+  config.sbd_out_channels = own.sbd_out_channels;
+  config.sbd_hidden_dim = own.sbd_hidden_dim;
+  config.lang_dim = own.lang_dim;
+  config.sbd_levels = own.sbd_levels;
+  config.sbd_rgb = own.sbd_rgb;
+  config.sbd_head = own.sbd_head;
+  config.sbd_dpt = own.sbd_dpt;
+  config.bn_eps = own.bn_eps;
+  config.bn_momentum = own.bn_momentum;
+  return config;
+}
+
 }  // namespace lvggt

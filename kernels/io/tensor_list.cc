@@ -191,6 +191,13 @@ std::vector<TensorSpec> decoder_tensors(const ModelConfig& config) {
   return list.take();
 }
 
+bool is_decoder_tensor(std::string_view name) {
+  for (const std::string_view prefix :
+       {"feature_extractor.", "lang_encoder.", "lang_decoder", "rgb_encoder.", "rgb_decoder."})
+    if (name.starts_with(prefix)) return true;
+  return false;
+}
+
 bool known_unused_tensor(std::string_view name) {
   return name.starts_with("track_head.") || name.starts_with("train.") || name == "aggregator.patch_embed.mask_token" ||
          name.ends_with(".num_batches_tracked");

@@ -86,6 +86,9 @@ std::string token_difference(const TokenSettings& found, const TokenSettings& wa
 // file, with or without heads and decoder.
 std::string encoder_sha256(const Checkpoint& checkpoint, Context& ctx);
 
+// The same over all tensors of the decoder.
+std::string decoder_sha256(const Checkpoint& checkpoint, Context& ctx);
+
 // How the encoder's weights are kept in memory: "f32", or "40 bf16, 96 int8" where they differ.
 std::string encoder_storage(const Checkpoint& checkpoint);
 

@@ -23,6 +23,8 @@ struct LoadOptions {
       {};  // safetensors with the geometry tensors, and the decoder's unless `decoder` is given;
            // a file, a sharded model's index or the folder that holds it
   std::string decoder = {};  // safetensors with the decoder tensors; may be empty
+  std::string state_decoder =
+      {};  // safetensors with a second decoder, for what changes with time; may be empty
   std::string config =
       {};  // JSON configuration; empty: the metadata's "config", else what the shapes tell
   std::string overrides = {};  // safetensors whose tensors weight.NAME take the place of NAME and
@@ -41,6 +43,11 @@ struct LoadOptions {
 ModelConfig infer_config(const Safetensors& geometry, const Safetensors* decoder,
                          const ModelConfig& base = {});
 
+// The configuration of a decoder file beside a geometry model of that configuration: the decoder's
+// part from its metadata's "config", else from its shapes. kMismatch when its metadata say that it
+// reads the tokens of another encoder.
+ModelConfig infer_decoder_config(const Safetensors& decoder, const ModelConfig& geometry);
+
 // "lang_dim is 6, not 3; ...": how `found` differs from `expected`, without the names. Empty when
 // it does not.
 std::string config_difference(const ModelConfig& found, const ModelConfig& expected);
@@ -53,6 +60,9 @@ class Checkpoint {
   // kMismatch error reports all that is missing or misshapen, and which model the files look like
   // instead.
   explicit Checkpoint(const LoadOptions& options);
+
+  // Of options.decoder alone, beside a geometry model of that configuration, which is not opened.
+  Checkpoint(const LoadOptions& options, const ModelConfig& geometry);
 
   const ModelConfig& config() const { return config_; }
 
@@ -107,6 +117,7 @@ class Checkpoint {
   Found look_up(const std::string& name) const;
   Found find(const std::string& name) const;
   void settle_config(const LoadOptions& options);
+  void check_tensors(bool strict);
   void refuse_other_models() const;
   std::vector<TensorSpec> expected_tensors() const;
   void describe_storage(const std::vector<TensorSpec>& expected);
@@ -126,6 +137,7 @@ class Checkpoint {
   bool has_decoder_ = false;
   bool has_point_head_ = false;
   bool skip_points_ = false;
+  bool decoder_only_ = false;  // geometry_ is the file of a decoder
   bool allow_nonfinite_ = false;
   std::vector<std::string> warnings_;
   // Names of tensors found odd while reading; guarded because blocks are loaded in parallel.

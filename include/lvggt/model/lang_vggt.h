@@ -30,6 +30,7 @@ class LangVggt {
     model.geometry_ = load_stream_vggt(checkpoint, ctx);
     if (checkpoint.has_decoder()) model.decoder_ = load_semantic_bridging_decoder(checkpoint);
     model.warnings_ = checkpoint.warnings();
+    if (!options.state_decoder.empty()) model.load_state_decoder(options);
     return model;
   }
   static LangVggt load(const std::string& weights) {
@@ -40,6 +41,13 @@ class LangVggt {
   const ModelConfig& config() const { return config_; }
   bool has_decoder() const { return decoder_.has_value(); }
   bool has_point_head() const { return geometry_.point_head.has_value(); }
+  // A second decoder, whose features change with what objects do; it reads the same tokens.
+  bool has_state_decoder() const { return state_decoder_.has_value(); }
+  const ModelConfig& state_config() const { return state_config_; }  // the decoder's part counts
+  const SemanticBridgingDecoder& state_decoder() const {
+    LVGGT_CHECK(has_state_decoder(), "model: no state decoder was loaded");
+    return *state_decoder_;
+  }
   // What was odd about the weights but did not stop the loading, one sentence each.
   const std::vector<std::string>& warnings() const { return warnings_; }
 
@@ -58,9 +66,18 @@ class LangVggt {
  private:
   LangVggt() = default;
 
-  ModelConfig config_;
+  void load_state_decoder(LoadOptions options) {
+    options.decoder = options.state_decoder;
+    const Checkpoint checkpoint(options, config_);
+    state_config_ = checkpoint.config();
+    state_decoder_ = load_semantic_bridging_decoder(checkpoint);
+    for (const std::string& warning : checkpoint.warnings())
+      warnings_.push_back("state decoder: " + warning);
+  }
+
+  ModelConfig config_, state_config_;
   StreamVggt geometry_;
-  std::optional<SemanticBridgingDecoder> decoder_;
+  std::optional<SemanticBridgingDecoder> decoder_, state_decoder_;
   std::vector<std::string> warnings_;
 };
 

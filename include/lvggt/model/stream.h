@@ -24,6 +24,7 @@ struct Frame {
   View<const float, 2> points_confidence;  // [H, W], at least 1
   View<const float, 3> rgb;                // [H, W, 3], in [0, 1]
   View<const float, 4> language;           // [level, H, W, lang_dim]
+  View<const float, 4> states;             // [level, H, W, lang_dim of the state decoder]
   StageTimes times;
 };
 
@@ -74,7 +75,7 @@ class Stream {
     Tensor<float, 3> pose_encodings = {};  // [iterations, 1, 9]
     Tensor<float, 2> depth = {}, depth_confidence = {}, points_confidence = {};
     Tensor<float, 3> points = {}, rgb = {};
-    Tensor<float, 4> language = {};
+    Tensor<float, 4> language = {}, states = {};
   };
 
   void check_options() const {
@@ -94,11 +95,22 @@ class Stream {
   }
 
   bool runs_decoder() const { return options_.decoder && model_->has_decoder(); }
+  bool runs_state_decoder() const { return options_.decoder && model_->has_state_decoder(); }
+
+  // The decoder whose RGB head runs, null without any: the same picture is not painted twice.
+  const SemanticBridgingDecoder* decoder_of_rgb() const {
+    if (!options_.rgb) return nullptr;
+    if (runs_decoder() && model_->decoder().rgb_decoder) return &model_->decoder();
+    if (runs_state_decoder() && model_->state_decoder().rgb_decoder)
+      return &model_->state_decoder();
+    return nullptr;
+  }
 
   void prepare(std::int64_t H, std::int64_t W) {
     const ModelConfig& c = model_->config();
     const StreamVggt& geometry_model = model_->geometry();
-    LVGGT_CHECK(!runs_decoder() || (H >= 8 && W >= 8), "stream: a frame of ", W, " x ", H,
+    const bool decodes = runs_decoder() || runs_state_decoder();
+    LVGGT_CHECK(!decodes || (H >= 8 && W >= 8), "stream: a frame of ", W, " x ", H,
                 " pixels is too small for the decoder, which halves it three times");
     FrameGeometry geometry = make_frame_geometry(geometry_model.aggregator, H, W, *ctx_);
     const std::int64_t P = geometry.num_tokens(geometry_model.aggregator);
@@ -121,13 +133,14 @@ class Stream {
       b->points = Tensor<float, 3>(Shape{H, W, std::int64_t{3}});
       b->points_confidence = Tensor<float, 2>(Shape{H, W});
     }
-    if (runs_decoder()) {
-      const std::int64_t Ho = options_.decoder_height > 0 ? options_.decoder_height : H;
-      const std::int64_t Wo = options_.decoder_width > 0 ? options_.decoder_width : W;
-      b->language = Tensor<float, 4>(Shape{c.sbd_levels, Ho, Wo, c.lang_dim});
-      if (options_.rgb && model_->decoder().rgb_decoder)
-        b->rgb = Tensor<float, 3>(Shape{Ho, Wo, std::int64_t{3}});
+    const std::int64_t Ho = options_.decoder_height > 0 ? options_.decoder_height : H;
+    const std::int64_t Wo = options_.decoder_width > 0 ? options_.decoder_width : W;
+    if (runs_decoder()) b->language = Tensor<float, 4>(Shape{c.sbd_levels, Ho, Wo, c.lang_dim});
+    if (runs_state_decoder()) {
+      const ModelConfig& state = model_->state_config();
+      b->states = Tensor<float, 4>(Shape{state.sbd_levels, Ho, Wo, state.lang_dim});
     }
+    if (decoder_of_rgb() != nullptr) b->rgb = Tensor<float, 3>(Shape{Ho, Wo, std::int64_t{3}});
     buffers_ = std::move(b);
   }
 
@@ -211,20 +224,28 @@ class Stream {
       frame.points = b.points;
       frame.points_confidence = b.points_confidence;
     }
-    if (runs_decoder()) {
-      const StageTimer timer(frame.times.decoder);
-      const View<float, 3> rgb = b.rgb.empty() ? View<float, 3>() : b.rgb.view();
-      semantic_bridging_decoder_forward(b.language, rgb, taps, b.geometry.h, b.geometry.w,
-                                        b.geometry.H, b.geometry.W, model_->decoder(), observer,
-                                        *ctx_);
-      for (std::int64_t level = 0; level < b.language.extent(0); ++level)
-        check_finite(pixel_rows(b.language[level]), "the decoder's language features");
-      frame.language = b.language;
-      if (!rgb.empty()) {
-        check_finite(pixel_rows(rgb), "the decoder's colours");
-        frame.rgb = rgb;
-      }
+    if (runs_decoder())
+      frame.language = run_decoder(frame, b.language, taps, model_->decoder(), observer);
+    // The observer knows the stages of one decoder by name.
+    if (runs_state_decoder())
+      frame.states = run_decoder(frame, b.states, taps, model_->state_decoder(), nullptr);
+  }
+
+  View<const float, 4> run_decoder(Frame& frame, View<float, 4> language,
+                                   const std::array<View<const float, 2>, 4>& taps,
+                                   const SemanticBridgingDecoder& decoder, Observer* observer) {
+    Buffers& b = *buffers_;
+    const StageTimer timer(frame.times.decoder);
+    const View<float, 3> rgb = &decoder == decoder_of_rgb() ? b.rgb.view() : View<float, 3>();
+    semantic_bridging_decoder_forward(language, rgb, taps, b.geometry.h, b.geometry.w, b.geometry.H,
+                                      b.geometry.W, decoder, observer, *ctx_);
+    for (std::int64_t level = 0; level < language.extent(0); ++level)
+      check_finite(pixel_rows(language[level]), "the decoder's language features");
+    if (!rgb.empty()) {
+      check_finite(pixel_rows(rgb), "the decoder's colours");
+      frame.rgb = rgb;
     }
+    return language;
   }
 
   void check_pixels(View<const float, 3> pixels) const {

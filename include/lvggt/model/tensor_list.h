@@ -34,6 +34,9 @@ std::vector<TensorSpec> geometry_tensors(const ModelConfig& config);
 // encoders).
 std::vector<TensorSpec> decoder_tensors(const ModelConfig& config);
 
+// Whether the name is one of a decoder's tensors, by its prefix.
+bool is_decoder_tensor(std::string_view name);
+
 // Prefixes of the language decoders, in the order of the levels, without a final dot.
 std::vector<std::string> language_decoder_names(const ModelConfig& config);
 
