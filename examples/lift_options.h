@@ -34,6 +34,7 @@ struct LiftOptions {
   bool no_ply = false, no_depth = false, no_confidence = false, no_rgb = false,
        no_semantics = false;
   bool no_colmap = false, no_contact_sheet = false, no_decoder = false;
+  bool no_codes = false, no_frames = false;
   bool force = false, resume = false, dry_run = false, hash = false;
 
   // After parsing: words and negations become what the library takes. Throws kUsage.
@@ -69,6 +70,8 @@ struct LiftOptions {
     outputs.semantics = !no_semantics;
     outputs.colmap = !no_colmap;
     outputs.contact_sheet = !no_contact_sheet;
+    outputs.codes = !no_codes;
+    outputs.frames = !no_frames;
     outputs.rgb_head_colors = point_colors == "rgb";
   }
 
@@ -84,7 +87,9 @@ struct LiftOptions {
                                        {"semantics", outputs.semantics},
                                        {"colmap", outputs.colmap},
                                        {"contact_sheet", outputs.contact_sheet},
-                                       {"images", outputs.images}})
+                                       {"images", outputs.images},
+                                       {"codes", outputs.codes},
+                                       {"frames", outputs.frames}})
       if (wanted) written += (written.empty() ? "" : " ") + std::string(name);
     std::string percentile;
     lvggt::append_number(percentile, outputs.percentile);
@@ -126,10 +131,13 @@ inline void add_inputs(lvggt::cli::Program& program, LiftOptions& o) {
                  "The semantic bridging decoder, unless it is in the same file; without any, there "
                  "is geometry only")
       ->type_name("FILE");
+  app.add_option("--state-decoder", o.weights.state_decoder,
+                 "A second decoder, for states (dynamic semantics); it shares the geometry's work")
+      ->type_name("FILE");
   app.add_option("--config", o.weights.config,
                  "The model's configuration; otherwise what the weights' metadata or shapes tell")
       ->type_name("JSON");
-  app.add_flag("--no-decoder", o.no_decoder, "Geometry only, also if there is a decoder");
+  app.add_flag("--no-decoder", o.no_decoder, "Geometry only, also if there are decoders");
   app.add_flag("--strict", o.weights.strict, "Refuse weights with tensors the model does not use");
   app.add_option("--sha256", o.sha256, "Refuse weights whose file has another SHA-256")
       ->type_name("HEX");
@@ -234,6 +242,10 @@ inline void add_outputs(lvggt::cli::Program& program, LiftOptions& o) {
   app.add_flag("--no-confidence", o.no_confidence, "No confidence maps");
   app.add_flag("--no-rgb", o.no_rgb, "No pictures of the RGB head");
   app.add_flag("--no-semantics", o.no_semantics, "No semantic maps (points keep their vectors)");
+  app.add_flag("--no-codes", o.no_codes,
+               "No semantic codes, which query_video needs (points keep theirs)");
+  app.add_flag("--no-frames", o.no_frames,
+               "No pictures of what the model saw, on which query_video paints");
   app.add_flag("--no-colmap", o.no_colmap, "No COLMAP model");
   app.add_flag("--no-contact-sheet", o.no_contact_sheet, "No contact sheet");
 }
@@ -252,5 +264,7 @@ inline void add_lift_options(lvggt::cli::Program& program, LiftOptions& options)
       "5 partial result (the video ends early, or inputs of the list failed), 130 interrupted.\n\n"
       "Examples:\n"
       "  lift_video clip.mp4 --weights model.safetensors --decoder decoder.safetensors --out clip\n"
+      "  query_video clip \"the cup\" --text-encoder CLIP --autoencoder ae.safetensors --out "
+      "answer\n"
       "  mpirun -n 4 lift_video --list videos.txt --weights model.safetensors --out lifted");
 }

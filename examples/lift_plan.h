@@ -41,24 +41,68 @@ inline Input open_input(const LiftOptions& options) {
   return input;
 }
 
+// The files of the model, names and shapes only, and what their decoders are: known before anything
+// large is read.
+class ModelFiles {
+ public:
+  explicit ModelFiles(const LoadOptions& options) : checkpoint_(options) {
+    if (options.state_decoder.empty()) return;
+    LoadOptions alone = options;
+    alone.decoder = options.state_decoder;
+    state_.emplace(alone, checkpoint_.config());
+  }
+  const Checkpoint& checkpoint() const { return checkpoint_; }
+  const Checkpoint* state() const { return state_ ? &*state_ : nullptr; }
+
+ private:
+  Checkpoint checkpoint_;
+  std::optional<Checkpoint> state_;
+};
+
+// Levels and values of the decoders that run.
+struct DecoderSizes {
+  std::int64_t levels = 0, dim = 0, state_levels = 0, state_dim = 0;
+  std::int64_t maps() const { return levels + state_levels; }
+  std::int64_t values() const { return levels * dim + state_levels * state_dim; }
+};
+
+inline DecoderSizes decoder_sizes(const ModelFiles& files, const StreamOptions& stream) {
+  DecoderSizes sizes;
+  if (!stream.decoder) return sizes;
+  if (files.checkpoint().has_decoder()) {
+    sizes.levels = files.checkpoint().config().sbd_levels;
+    sizes.dim = files.checkpoint().config().lang_dim;
+  }
+  if (files.state() != nullptr) {
+    sizes.state_levels = files.state()->config().sbd_levels;
+    sizes.state_dim = files.state()->config().lang_dim;
+  }
+  return sizes;
+}
+
 // Memory beside the model's: what this process holds by now (its libraries, the decoder of the
 // video, the first frame), the code it has yet to touch, the point cloud, the pictures of a frame
 // and of the contact sheet, and the decoding of the original.
 inline std::size_t program_bytes(const ImageTransform& transform, std::size_t frames,
-                                 std::int64_t levels, std::int64_t lang_dim) {
+                                 const DecoderSizes& decoders) {
   constexpr std::size_t kCode = std::size_t{20} << 20;
   const auto width = static_cast<std::size_t>(transform.width);
   const auto height = static_cast<std::size_t>(transform.height);
   const std::size_t pixels = width * height;
   const auto original = static_cast<std::size_t>(transform.original_width) *
                         static_cast<std::size_t>(transform.original_height);
-  const auto semantics = static_cast<std::size_t>(levels * (4 * lang_dim + 3));  // 0 levels: none
+  // Vectors of the points, a picture of each map, and the codes of one decoder on their way to
+  // disk.
+  const std::int64_t on_disk =
+      std::max(decoders.levels * decoders.dim, decoders.state_levels * decoders.state_dim);
+  const auto semantics = static_cast<std::size_t>(4 * decoders.levels * decoders.dim +
+                                                  3 * decoders.maps() + 4 * on_disk);
   // The contact sheet keeps up to 16 frames, each with four pictures and the levels.
   constexpr std::size_t kSheetFrames = 16, kSheetCellWidth = 176;
   const std::size_t cell_width = std::min<std::size_t>(width, kSheetCellWidth);
   const std::size_t cell = cell_width * (cell_width * height / width + 1) * 3;
   const std::size_t sheet =
-      std::min(frames, kSheetFrames) * (4 + static_cast<std::size_t>(levels)) * cell;
+      std::min(frames, kSheetFrames) * (4 + static_cast<std::size_t>(decoders.maps())) * cell;
   // Before the first video of a list: later ones find the model there.
   static const std::size_t process = cli::resident_bytes();
   return process + kCode + pixels * (80 + semantics) + original * 24 + sheet;
@@ -72,31 +116,53 @@ struct Plan {
 // Memory of the run with other options.
 using PlanOf = std::function<std::size_t(const LiftOptions&)>;
 
-inline Plan plan_run(const Checkpoint& checkpoint, const LiftOptions& options,
+// A second decoder: its weights and outputs come on top, scratch memory is used in turn.
+inline void add_state_decoder(MemoryPlan& plan, const Checkpoint& state, const LiftOptions& options,
+                              const ImageTransform& transform) {
+  const ModelConfig& config = state.config();
+  const auto plan_with = [&](bool decoder) {
+    StreamOptions some = options.stream;
+    some.max_past_frames = 1;
+    some.decoder = decoder;
+    // The geometry's weights cancel out, whatever their storage.
+    return plan_memory(
+        config, transform.height, transform.width, some, [&](const std::string& weight) {
+          if (options.weights.storage) return options.weights.storage->of_weight(weight);
+          return is_decoder_tensor(weight) ? state.storage_of(weight) : Storage::kF32;
+        });
+  };
+  const MemoryPlan with = plan_with(true);
+  plan.weights += with.weights - plan_with(false).weights;
+  if (!options.stream.decoder) return;
+  const auto pixels =
+      static_cast<std::size_t>(transform.width) * static_cast<std::size_t>(transform.height);
+  const auto maps = static_cast<std::size_t>(config.sbd_levels * config.lang_dim) * pixels;
+  plan.arenas = std::max(plan.arenas, with.arenas) + maps * sizeof(float);
+}
+
+inline Plan plan_run(const ModelFiles& files, const LiftOptions& options,
                      const ImageTransform& transform, std::int64_t past_frames,
                      std::size_t num_frames) {
   StreamOptions stream = options.stream;
   stream.max_past_frames = past_frames;
-  stream.decoder = stream.decoder && checkpoint.has_decoder();
-  const auto plan_with = [&](const StreamOptions& some) {
+  const auto plan_with = [&](const Checkpoint& checkpoint, bool decoder) {
+    StreamOptions some = stream;
+    some.decoder = decoder;
     return plan_memory(checkpoint.config(), transform.height, transform.width, some,
                        [&](const std::string& weight) {
                          return options.weights.storage ? options.weights.storage->of_weight(weight)
                                                         : checkpoint.storage_of(weight);
                        });
   };
-  Plan plan;
-  plan.model = plan_with(stream);
-  if (!stream.decoder && checkpoint.has_decoder()) {  // loaded, though it will not run
-    StreamOptions loaded = stream;
-    loaded.decoder = true;
-    const std::size_t weights = plan_with(loaded).weights;
-    plan.model.total += weights - plan.model.weights;
-    plan.model.weights = weights;
-  }
-  plan.total = plan.model.total + program_bytes(transform, num_frames,
-                                                stream.decoder ? checkpoint.config().sbd_levels : 0,
-                                                checkpoint.config().lang_dim);
+  // A decoder that is there is loaded, also if it will not run.
+  const Checkpoint& checkpoint = files.checkpoint();
+  const bool runs = stream.decoder && checkpoint.has_decoder();
+  Plan plan{plan_with(checkpoint, runs), 0};
+  plan.model.weights = plan_with(checkpoint, checkpoint.has_decoder()).weights;
+  if (files.state() != nullptr) add_state_decoder(plan.model, *files.state(), options, transform);
+  plan.model.total = plan.model.weights + plan.model.cache + plan.model.arenas;
+  plan.total =
+      plan.model.total + program_bytes(transform, num_frames, decoder_sizes(files, options.stream));
   return plan;
 }
 
@@ -146,7 +212,7 @@ inline std::vector<cli::MemoryChoice> storage_choices(const LiftOptions& options
 }
 
 // Refuses the run when it needs more memory than it may have, and says which options would fit.
-inline void check_plan(const Plan& plan, const Checkpoint& checkpoint, const LiftOptions& options,
+inline void check_plan(const Plan& plan, const ModelFiles& files, const LiftOptions& options,
                        const Input& input) {
   cli::MemoryLimit limit = cli::available_memory();
   // What this process holds already is part of the plan.
@@ -156,7 +222,7 @@ inline void check_plan(const Plan& plan, const Checkpoint& checkpoint, const Lif
   const std::int64_t past = reachable_past_frames(options, input);
   const auto total = [&](const LiftOptions& changed, const ImageTransform& transform,
                          std::int64_t frames) {
-    return plan_run(checkpoint, changed, transform, frames, num_frames(input)).total;
+    return plan_run(files, changed, transform, frames, num_frames(input)).total;
   };
   std::vector<cli::MemoryKnob> knobs;
   knobs.push_back({"--max-past-frames", 1, std::max<std::int64_t>(past, 1), 1,
@@ -186,15 +252,32 @@ inline void check_plan(const Plan& plan, const Checkpoint& checkpoint, const Lif
 }
 
 // How long the frames of the run will take, from a few layers timed on this machine.
-inline void print_times(const LiftOptions& options, const Input& input,
-                        const Checkpoint& checkpoint, int threads) {
+inline void print_times(const LiftOptions& options, const Input& input, const ModelFiles& files,
+                        int threads) {
   StreamOptions stream = options.stream;
-  stream.decoder = stream.decoder && checkpoint.has_decoder();
   stream.max_past_frames = reachable_past_frames(options, input);
   Context ctx(threads);
-  const TimePlan plan = plan_time(
-      checkpoint.config(), input.transform.height, input.transform.width, stream,
-      [&](const std::string& weight) { return checkpoint.storage_of(weight); }, ctx);
+  const auto plan_with = [&](const ModelConfig& config, bool decoder) {
+    StreamOptions some = stream;
+    some.decoder = decoder;
+    return plan_time(
+        config, input.transform.height, input.transform.width, some,
+        [&](const std::string& weight) {
+          if (!decoder || &config == &files.checkpoint().config())
+            return files.checkpoint().storage_of(weight);
+          return is_decoder_tensor(weight) ? files.state()->storage_of(weight)
+                                           : files.checkpoint().storage_of(weight);
+        },
+        ctx);
+  };
+  TimePlan plan =
+      plan_with(files.checkpoint().config(), stream.decoder && files.checkpoint().has_decoder());
+  if (stream.decoder && files.state() != nullptr) {
+    const double decoder = std::max(0.0, plan_with(files.state()->config(), true).first_frame -
+                                             plan_with(files.state()->config(), false).first_frame);
+    plan.first_frame += decoder;
+    plan.full_window += decoder;
+  }
   const auto text = [](double seconds) { return cli::fixed(seconds, seconds < 1 ? 3 : 1) + " s"; };
   std::printf(
       "time          about %s of model time for the first frame, %s with %lld past frames\n",
@@ -202,19 +285,36 @@ inline void print_times(const LiftOptions& options, const Input& input,
       static_cast<long long>(stream.max_past_frames));
 }
 
+// "with the decoder", "with the decoder and the state decoder", ...
+inline std::string decoders_in_words(const DecoderSizes& sizes) {
+  if (sizes.maps() == 0) return "geometry only";
+  std::string words;
+  if (sizes.levels > 0)
+    words = concat("with the decoder (", sizes.levels, " x ", sizes.dim, " values a pixel)");
+  if (sizes.state_levels > 0)
+    words += concat(words.empty() ? "with" : " and", " the state decoder (", sizes.state_levels,
+                    " x ", sizes.state_dim, ")");
+  return words;
+}
+
 inline void print_plan(const LiftOptions& options, const Input& input, const Plan& plan,
-                       const Checkpoint& checkpoint, const cli::ThreadChoice& threads) {
+                       const ModelFiles& files, const cli::ThreadChoice& threads) {
+  const ModelConfig& config = files.checkpoint().config();
+  const DecoderSizes decoders = decoder_sizes(files, options.stream);
   const ImageTransform& t = input.transform;
   const std::int64_t frames = input.source->expected_frames();
   std::printf("input         %s: %s frames of %d x %d\n", options.video.c_str(),
               frames < 0 ? "an unknown number of" : std::to_string(frames).c_str(),
               t.original_width, t.original_height);
   std::printf("model frames  %d x %d (mode %s)\n", t.width, t.height, options.mode.c_str());
-  std::printf(
-      "model         %lld aggregator layers of width %lld, %s\n",
-      static_cast<long long>(checkpoint.config().agg_depth),
-      static_cast<long long>(checkpoint.config().embed_dim),
-      options.stream.decoder && checkpoint.has_decoder() ? "with the decoder" : "geometry only");
+  std::printf("model         %lld aggregator layers of width %lld, %s\n",
+              static_cast<long long>(config.agg_depth), static_cast<long long>(config.embed_dim),
+              decoders_in_words(decoders).c_str());
+  if (options.outputs.codes && decoders.maps() > 0)
+    std::printf(
+        "codes         %s a frame, for queries\n",
+        cli::bytes_text(2 * static_cast<std::size_t>(decoders.values() * t.width * t.height))
+            .c_str());
   std::printf("past frames   %lld at most\n",
               static_cast<long long>(options.stream.max_past_frames));
   std::printf("threads       %d (%s)\n", threads.threads, threads.reason.c_str());

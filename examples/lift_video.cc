@@ -12,6 +12,7 @@
 #include "lvggt/cli/output_folder.h"
 #include "lvggt/cli/progress.h"
 #include "lvggt/cli/run_record.h"
+#include "lvggt/data/token_cache.h"
 #include "lvggt/io/hash.h"
 #include "lvggt/lvggt.h"
 #include "lvggt/model/stream.h"
@@ -52,13 +53,21 @@ struct Times {
   }
 };
 
-RunFormat run_format(const LiftOptions& options, const Input& input, const ModelConfig& config,
-                     bool decoder) {
+RunFormat run_format(const LiftOptions& options, const Input& input, const ModelFiles& files,
+                     Context& ctx) {
   RunFormat format;
   format.transform = input.transform;
-  format.levels = decoder ? config.sbd_levels : 0;
-  format.lang_dim = decoder ? config.lang_dim : 0;
-  format.has_rgb = decoder && config.sbd_rgb;
+  const DecoderSizes decoders = decoder_sizes(files, options.stream);
+  format.levels = decoders.levels;
+  format.lang_dim = decoders.dim;
+  format.state_levels = decoders.state_levels;
+  format.state_dim = decoders.state_dim;
+  format.has_rgb = (decoders.levels > 0 && files.checkpoint().config().sbd_rgb) ||
+                   (decoders.state_levels > 0 && files.state()->config().sbd_rgb);
+  if (options.outputs.codes && decoders.levels > 0)
+    format.decoder_sha256 = decoder_sha256(files.checkpoint(), ctx);
+  if (options.outputs.codes && decoders.state_levels > 0)
+    format.state_sha256 = decoder_sha256(*files.state(), ctx);
   format.names_are_files = input.next->name != concat("frame ", input.next->source_index);
   format.expected_frames = input.source->expected_frames();
   const std::filesystem::path path(cli::without_trailing_slashes(options.video));
@@ -72,16 +81,15 @@ RunFormat run_format(const LiftOptions& options, const Input& input, const Model
 // The loop over the frames; `record` is kept up to date whatever ends it.
 class Lift {
  public:
-  Lift(const LiftOptions& options, Input& input, const LangVggt& model, cli::RunRecord& record,
-       Times& times, const cli::InterruptGuard& interrupt, Context& ctx)
+  Lift(const LiftOptions& options, Input& input, const ModelFiles& files, const LangVggt& model,
+       cli::RunRecord& record, Times& times, const cli::InterruptGuard& interrupt, Context& ctx)
       : options_(options),
         input_(input),
         record_(record),
         times_(times),
         interrupt_(interrupt),
         ctx_(ctx),
-        format_(run_format(options, input, model.config(),
-                           options.stream.decoder && model.has_decoder())),
+        format_(run_format(options, input, files, ctx)),
         stream_(model, ctx, options.stream),
         progress_(format_.expected_frames) {}
 
@@ -122,11 +130,11 @@ class Lift {
     const StageTimer timer(times_.write);
     // The folder is made when there is something to put into it.
     if (!writer_) open_folder();
-    const RunFrame results{
-        {frame.index, input_.next->source_index, input_.next->name, input_.next->timestamp,
-         frame.camera},
-        input_.next->image.pixels,
-        {prepared.pixels, frame.depth, frame.depth_confidence, frame.rgb, frame.language}};
+    const RunFrame results{{frame.index, input_.next->source_index, input_.next->name,
+                            input_.next->timestamp, frame.camera},
+                           input_.next->image.pixels,
+                           {prepared.pixels, frame.depth, frame.depth_confidence, frame.rgb,
+                            frame.language, frame.states}};
     const bool complete = writer_->write(
         results, [this] { return interrupt_.requested(); }, ctx_);
     record_.frames = writer_->num_frames();
@@ -217,6 +225,7 @@ cli::RunRecord make_record(const LiftOptions& options, const Input& input,
   for (const auto& [role, path] : {std::pair{"video", options.video},
                                    {"weights", options.weights.weights},
                                    {"decoder", options.weights.decoder},
+                                   {"state_decoder", options.weights.state_decoder},
                                    {"config", options.weights.config}}) {
     if (path.empty()) continue;
     record.inputs.push_back(cli::describe_input(role, path, options.hash));
@@ -232,11 +241,10 @@ class SharedModel {
   explicit SharedModel(const LiftOptions& options)
       : options_(options),
         threads_(cli::choose_threads(options.threads)),
-        checkpoint_(options.weights) {}
+        files_(options.weights) {}
 
   const cli::ThreadChoice& threads() const { return threads_; }
-  // Names and shapes only: what a run needs is known before anything large is read.
-  const Checkpoint& checkpoint() const { return checkpoint_; }
+  const ModelFiles& files() const { return files_; }
 
   Context& ctx() {
     if (!ctx_) ctx_.emplace(threads_.threads);
@@ -247,18 +255,19 @@ class SharedModel {
   const LangVggt& get(double& seconds) {
     if (model_) return *model_;
     const StageTimer timer(seconds);
-    if (!checkpoint_.all_f32()) say(checkpoint_.storage_summary());
+    if (!files_.checkpoint().all_f32()) say(files_.checkpoint().storage_summary());
     if (!options_.sha256.empty()) check_sha256(options_.weights.weights, options_.sha256);
     model_.emplace(LangVggt::load(options_.weights, ctx()));
     for (const std::string& warning : model_->warnings()) say("warning: " + warning);
-    if (!model_->has_decoder()) say("no decoder: geometry only, without semantics and RGB");
+    if (!model_->has_decoder() && !model_->has_state_decoder())
+      say("no decoder: geometry only, without semantics and RGB");
     return *model_;
   }
 
  private:
   const LiftOptions& options_;
   cli::ThreadChoice threads_;
-  Checkpoint checkpoint_;
+  ModelFiles files_;
   std::optional<Context> ctx_;
   std::optional<LangVggt> model_;
 };
@@ -274,15 +283,15 @@ void check_folder(const LiftOptions& options) {
 int lift_one(const LiftOptions& options, SharedModel& shared, const cli::InterruptGuard& interrupt,
              bool& done_before, int argc, char** argv) {
   check_folder(options);
-  const Checkpoint& checkpoint = shared.checkpoint();
+  const ModelFiles& files = shared.files();
   const cli::ThreadChoice& threads = shared.threads();
   Input input = open_input(options);
-  const Plan plan = plan_run(checkpoint, options, input.transform,
-                             reachable_past_frames(options, input), num_frames(input));
-  if (options.dry_run) print_plan(options, input, plan, checkpoint, threads);
-  check_plan(plan, checkpoint, options, input);
+  const Plan plan = plan_run(files, options, input.transform, reachable_past_frames(options, input),
+                             num_frames(input));
+  if (options.dry_run) print_plan(options, input, plan, files, threads);
+  check_plan(plan, files, options, input);
   if (options.dry_run) {
-    print_times(options, input, checkpoint, threads.threads);
+    print_times(options, input, files, threads.threads);
     return 0;
   }
 
@@ -297,12 +306,12 @@ int lift_one(const LiftOptions& options, SharedModel& shared, const cli::Interru
   }
   say(concat(threads.threads, threads.threads == 1 ? " thread (" : " threads (", threads.reason,
              "), about ", cli::bytes_text(plan.total), " of memory (", breakdown(plan), ")"));
-  if (!checkpoint.all_f32()) say(checkpoint.storage_summary());
+  if (!files.checkpoint().all_f32()) say(files.checkpoint().storage_summary());
 
   Times times;
   const LangVggt& model = shared.get(times.load);
   record.warnings = model.warnings();
-  Lift run(options, input, model, record, times, interrupt, shared.ctx());
+  Lift run(options, input, files, model, record, times, interrupt, shared.ctx());
   try {
     run.run();
   } catch (const std::exception& error) {
@@ -351,8 +360,9 @@ int lift(LiftOptions& options, int argc, char** argv) {
   if (options.list.empty()) check_folder(options);
   const cli::InterruptGuard interrupt;
   SharedModel shared(options);
-  options.preprocess.size =
-      options.size > 0 ? options.size : static_cast<int>(shared.checkpoint().config().img_size);
+  options.preprocess.size = options.size > 0
+                                ? options.size
+                                : static_cast<int>(shared.files().checkpoint().config().img_size);
   if (!options.list.empty()) return lift_list(options, shared, interrupt, argc, argv);
   bool done_before = false;
   return lift_one(options, shared, interrupt, done_before, argc, argv);

@@ -10,12 +10,14 @@
 #include <vector>
 
 #include "lvggt/core/tensor.h"
+#include "lvggt/field/lifted_field.h"
 #include "lvggt/io/hash.h"
 #include "lvggt/io/json.h"
 #include "lvggt/io/png.h"
 #include "tests/support/child_process.h"
 #include "tests/support/files.h"
 #include "tests/support/temp_dir.h"
+#include "tests/support/tiny_model.h"
 
 using namespace lvggt;
 namespace fs = std::filesystem;
@@ -110,15 +112,17 @@ TEST_CASE("lift_video: writes every output of every frame, under its final name 
   INFO(result.err);
   REQUIRE(result.status == 0);
   CHECK(result.says("3 frames in"));
-  std::vector<std::string> expected{"cameras.json", "contact_sheet.png", "sparse/0/cameras.txt",
+  std::vector<std::string> expected{"cameras.json",        "contact_sheet.png",
+                                    "field.json",          "sparse/0/cameras.txt",
                                     "sparse/0/images.txt", "sparse/0/points3D.txt"};
   for (const char* frame : {"000000", "000001", "000002"}) {
     for (const char* folder : {"depth", "depth_color", "confidence", "rgb", "semantics_small",
-                               "semantics_middle", "semantics_large", "images"})
+                               "semantics_middle", "semantics_large", "images", "frames"})
       expected.push_back(std::string(folder) + "/" + frame + ".png");
     for (const char* folder : {"depth", "confidence"})
       expected.push_back(std::string(folder) + "/" + frame + ".json");
     expected.push_back(std::string("points/") + frame + ".ply");
+    expected.push_back(std::string("codes/") + frame + ".safetensors");
   }
   std::sort(expected.begin(), expected.end());
   std::vector<std::string> found;
@@ -137,12 +141,13 @@ TEST_CASE("lift_video: writes every output of every frame, under its final name 
 TEST_CASE("lift_video: outputs can be left out, and every n-th frame chosen") {
   const Scene scene;
   const Result result = scene.lift({"--no-ply", "--no-depth", "--no-confidence", "--no-rgb",
-                                    "--no-contact-sheet", "--every", "2"});
+                                    "--no-contact-sheet", "--no-frames", "--every", "2"});
   REQUIRE(result.status == 0);
   std::vector<std::string> found;
   for (const auto& [name, bytes] : contents(scene / "out")) found.push_back(name);
   CHECK(found == std::vector<std::string>{
-                     "cameras.json", "semantics_large/000000.png", "semantics_large/000002.png",
+                     "cameras.json", "codes/000000.safetensors", "codes/000002.safetensors",
+                     "field.json", "semantics_large/000000.png", "semantics_large/000002.png",
                      "semantics_middle/000000.png", "semantics_middle/000002.png",
                      "semantics_small/000000.png", "semantics_small/000002.png",
                      "sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"});
@@ -179,6 +184,65 @@ TEST_CASE(
   CHECK(files.count("points/000000.ply") == 1);
   CHECK(files.count("rgb/000000.png") == 0);
   CHECK(files.at("depth/000001.png") == contents(scene / "out").at("depth/000001.png"));
+}
+
+TEST_CASE("lift_video: a decoder, a state decoder or both run on one pass of the geometry") {
+  Scene scene(2);
+  ModelConfig config = load_config(LVGGT_TEST_DATA "/golden/config_tiny.json");
+  scene.init({"--config", LVGGT_TEST_DATA "/golden/config_tiny.json", "--seed", "1",
+              "--decoder-out", scene / "decoder.safetensors", scene / "geometry.safetensors"});
+  config.sbd_levels = 1;
+  config.lang_dim = 6;
+  test::write_tensors(scene / "states.safetensors", decoder_tensors(config), &config);
+  const auto lift = [&](const std::string& out, std::vector<std::string> more) {
+    more.insert(more.begin(), {scene / "frames", "--mode", "original", "--out", scene / out,
+                               "--weights", scene / "geometry.safetensors"});
+    return scene.run(more);
+  };
+  const std::string decoder = scene / "decoder.safetensors", states = scene / "states.safetensors";
+  const Result both = lift("both", {"--decoder", decoder, "--state-decoder", states});
+  INFO(both.err);
+  REQUIRE(both.status == 0);
+  REQUIRE(lift("decoder", {"--decoder", decoder}).status == 0);
+  REQUIRE(lift("states", {"--state-decoder", states}).status == 0);
+  const auto all = contents(scene / "both"), one = contents(scene / "decoder"),
+             other = contents(scene / "states");
+  for (const char* name : {"codes/000001.safetensors", "depth/000001.png", "points/000001.ply",
+                           "semantics_large/000001.png", "rgb/000001.png"})
+    CHECK_MESSAGE(all.at(name) == one.at(name), name);
+  for (const char* name : {"state_codes/000001.safetensors", "semantics_state/000001.png"})
+    CHECK_MESSAGE(all.at(name) == other.at(name), name);
+  CHECK(one.count("state_codes/000001.safetensors") == 0);
+  CHECK(other.count("codes/000001.safetensors") == 0);
+  CHECK(other.count("rgb/000001.png") == 1);  // of the state decoder
+  const LiftedField field = LiftedField::open(scene / "both");
+  CHECK(field.codes(CodesKind::kState).dim == 6);
+  CHECK(field.codes(CodesKind::kLanguage).decoder_sha256.size() == 64);
+  CHECK(test::read_bytes(scene / "both/run.json").find("\"role\": \"state_decoder\"") !=
+        std::string::npos);
+
+  REQUIRE(lift("none", {"--decoder", decoder, "--state-decoder", states, "--no-codes"}).status ==
+          0);
+  CHECK(contents(scene / "none").count("codes/000000.safetensors") == 0);
+  CHECK_FALSE(LiftedField::open(scene / "none").has_codes(CodesKind::kState));
+  const Result plan = lift("none", {"--state-decoder", states, "--dry-run"});
+  CHECK(plan.out.find("the state decoder (1 x 6)") != std::string::npos);
+  CHECK(plan.out.find("a frame, for queries") != std::string::npos);
+}
+
+TEST_CASE("lift_video: a state decoder of another model, or none, is refused by name") {
+  Scene scene(1);
+  ModelConfig config = load_config(LVGGT_TEST_DATA "/golden/config_tiny.json");
+  config.sbd_levels = 1;
+  config.taps[3] -= 1;
+  test::write_tensors(scene / "other.safetensors", decoder_tensors(config), &config);
+  const Result other = scene.lift({"--state-decoder", scene / "other.safetensors"});
+  CHECK(other.status == 3);
+  CHECK(other.says("other.safetensors: was made for another geometry model"));
+  const Result model = scene.lift({"--state-decoder", scene / "missing.safetensors"});
+  CHECK(model.status == 3);
+  CHECK(model.says("missing.safetensors"));
+  CHECK_FALSE(fs::exists(scene / "out"));
 }
 
 TEST_CASE(
@@ -386,7 +450,7 @@ TEST_CASE("C21: a video that ends early gives the frames there are, status 5, an
 
 TEST_CASE("D09: a disk that is full ends the run with status 1 and leaves no cut file") {
   const Scene scene;
-  test::ChildProcess child(scene.command(), 60'000);  // a point cloud has more
+  test::ChildProcess child(scene.command({"--no-codes"}), 60'000);  // a point cloud has more
   const Result result = finish(child);
   INFO(result.err);
   CHECK(result.status == 1);

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "lvggt/io/image.h"
 
+#include <algorithm>
 #include <cstdlib>
 #include <memory>
 #include <string_view>
@@ -9,6 +10,7 @@
 #include "kernels/io/orientation.h"
 #include "lvggt/io/checked.h"
 #include "lvggt/io/input_file.h"
+#include "lvggt/io/read_depth_png.h"
 
 // Static, so that a program with its own copy of stb_image still links.
 #define STB_IMAGE_STATIC
@@ -107,6 +109,16 @@ detail::ImageHeader check_file(std::span<const std::byte> bytes, const std::stri
   return header;
 }
 
+std::vector<std::byte> read_image_file(const std::string& path) {
+  const InputFile file(path);
+  if (file.size() > kMaxImageBytes)
+    fail(ErrorKind::kLimit, path, ": has ", file.size(), " bytes, more than the limit of ",
+         kMaxImageBytes);
+  std::vector<std::byte> bytes(static_cast<std::size_t>(file.size()));
+  file.read_at(0, bytes.data(), bytes.size());
+  return bytes;
+}
+
 }  // namespace
 
 Image image_from_pixels(View<const std::uint8_t, 3> pixels) {
@@ -150,13 +162,24 @@ ImageSize check_image(std::span<const std::byte> bytes, const std::string& name,
 }
 
 Image load_image(const std::string& path, const Limits& limits) {
-  const InputFile file(path);
-  if (file.size() > kMaxImageBytes)
-    fail(ErrorKind::kLimit, path, ": has ", file.size(), " bytes, more than the limit of ",
-         kMaxImageBytes);
-  std::vector<std::byte> bytes(static_cast<std::size_t>(file.size()));
-  file.read_at(0, bytes.data(), bytes.size());
-  return load_image(bytes, path, limits);
+  return load_image(read_image_file(path), path, limits);
+}
+
+Tensor<std::uint16_t, 2> load_grey16(const std::string& path, const Limits& limits) {
+  const std::vector<std::byte> bytes = read_image_file(path);
+  check_file(bytes, path, limits);
+  const auto* data = reinterpret_cast<const stbi_uc*>(bytes.data());
+  const auto size = static_cast<int>(bytes.size());
+  int width = 0, height = 0, num_channels = 0;
+  const std::unique_ptr<stbi_us, void (*)(void*)> values(
+      stbi_load_16_from_memory(data, size, &width, &height, &num_channels, 0), stbi_image_free);
+  if (!values)
+    fail(ErrorKind::kFormat, path, ": its pixels cannot be decoded: ", stbi_failure_reason());
+  if (num_channels != 1 || stbi_is_16_bit_from_memory(data, size) == 0)
+    fail(ErrorKind::kFormat, path, ": is not a grey picture of 16 bits a pixel");
+  Tensor<std::uint16_t, 2> grey(Shape{std::int64_t{height}, std::int64_t{width}});
+  std::copy_n(values.get(), grey.size(), grey.data());
+  return grey;
 }
 
 }  // namespace lvggt

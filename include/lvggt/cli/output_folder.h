@@ -122,7 +122,8 @@ inline void remove_earlier_run(const std::string& path, const std::vector<std::s
     if (!fs::is_directory(fs::symlink_status(inside, error))) continue;
     std::vector<fs::path> numbered;
     for (const auto& entry : fs::directory_iterator(inside, error))
-      if (is_numbered_file(entry.path().filename().string(), {".png", ".json", ".ply"}))
+      if (is_numbered_file(entry.path().filename().string(),
+                           {".png", ".json", ".ply", ".safetensors"}))
         numbered.push_back(entry.path());
     for (const fs::path& file : numbered) remove(file);
     remove(inside);

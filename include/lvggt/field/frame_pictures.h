@@ -20,13 +20,22 @@ inline std::vector<std::string> level_names(std::int64_t levels) {
   return names;
 }
 
+// Names of the state decoder's levels: "state", or with the names above where there are several.
+inline std::vector<std::string> state_level_names(std::int64_t levels) {
+  if (levels == 1) return {"state"};
+  std::vector<std::string> names = level_names(levels);
+  for (std::string& name : names) name = "state_" + name;
+  return names;
+}
+
 // What is shown of one frame.
 struct FrameMaps {
-  View<const float, 3> input;       // [H, W, 3] in [0, 1]
-  View<const float, 2> depth;       // [H, W]
-  View<const float, 2> confidence;  // [H, W]
-  View<const float, 3> rgb;         // [H, W, 3] in [0, 1]; may be empty
-  View<const float, 4> language;    // [level, H, W, d]; may be empty
+  View<const float, 3> input;        // [H, W, 3] in [0, 1]
+  View<const float, 2> depth;        // [H, W]
+  View<const float, 2> confidence;   // [H, W]
+  View<const float, 3> rgb;          // [H, W, 3] in [0, 1]; may be empty
+  View<const float, 4> language;     // [level, H, W, d]; may be empty
+  View<const float, 4> states = {};  // the same of the state decoder
 };
 
 // The outputs of a frame as 8-bit pictures. Colour ranges and the bases of semantic colours come
@@ -41,7 +50,7 @@ class FramePictures {
     color_values(sized(confidence_, maps.confidence), maps.confidence, confidence_range_);
     if (maps.rgb) color_bytes(sized(rgb_, maps.rgb), maps.rgb);
     for (std::size_t level = 0; level < semantic_colors_.size(); ++level) {
-      const View<const float, 3> features = maps.language[static_cast<std::int64_t>(level)];
+      const View<const float, 3> features = level_of(maps, static_cast<std::int64_t>(level));
       semantic_colors_[level].apply(sized(semantics_[level], features), features);
     }
   }
@@ -50,6 +59,7 @@ class FramePictures {
   View<const std::uint8_t, 3> depth() const { return depth_; }
   View<const std::uint8_t, 3> confidence() const { return confidence_; }
   View<const std::uint8_t, 3> rgb() const { return rgb_; }  // empty without an RGB head
+  // Levels of the language, then those of the states.
   std::size_t num_levels() const { return semantics_.size(); }
   View<const std::uint8_t, 3> semantics(std::size_t level) const { return semantics_[level]; }
 
@@ -59,12 +69,20 @@ class FramePictures {
   void fit(const FrameMaps& maps) {
     depth_range_ = robust_range(maps.depth);
     confidence_range_ = robust_range(maps.confidence);
-    const std::int64_t levels = maps.language ? maps.language.extent(0) : 0;
+    const std::int64_t levels = num_language(maps) + (maps.states ? maps.states.extent(0) : 0);
     semantics_.resize(static_cast<std::size_t>(levels));
     semantic_colors_.resize(static_cast<std::size_t>(levels));
     for (std::int64_t level = 0; level < levels; ++level)
-      semantic_colors_[static_cast<std::size_t>(level)].fit(maps.language[level]);
+      semantic_colors_[static_cast<std::size_t>(level)].fit(level_of(maps, level));
     fitted_ = true;
+  }
+
+  static std::int64_t num_language(const FrameMaps& maps) {
+    return maps.language ? maps.language.extent(0) : 0;
+  }
+  static View<const float, 3> level_of(const FrameMaps& maps, std::int64_t level) {
+    const std::int64_t states_from = num_language(maps);
+    return level < states_from ? maps.language[level] : maps.states[level - states_from];
   }
 
   template <int R>

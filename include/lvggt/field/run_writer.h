@@ -11,8 +11,11 @@
 #include <vector>
 
 #include "lvggt/field/contact_sheet.h"
+#include "lvggt/field/frame_files.h"
 #include "lvggt/field/frame_pictures.h"
+#include "lvggt/field/lifted_field.h"
 #include "lvggt/field/point_cloud.h"
+#include "lvggt/field/semantic_codes.h"
 #include "lvggt/io/cameras_json.h"
 #include "lvggt/io/colmap.h"
 #include "lvggt/io/depth_png.h"
@@ -26,6 +29,8 @@ namespace lvggt {
 struct RunOutputs {
   bool ply = true, depth = true, confidence = true, rgb = true, semantics = true;
   bool colmap = true, contact_sheet = true;
+  bool codes = true;             // what the decoders say, for queries
+  bool frames = true;            // the model's input, for pictures of answers
   bool images = false;           // the original pictures, for programs that read the COLMAP model
   bool rgb_head_colors = false;  // points take the RGB head's colours instead of the input's
   std::int64_t every = 1;        // files and COLMAP images for every n-th frame only
@@ -36,7 +41,9 @@ struct RunOutputs {
 // What a run is about; the same for all its frames.
 struct RunFormat {
   ImageTransform transform;
-  std::int64_t levels = 0, lang_dim = 0;  // 0 without language features
+  std::int64_t levels = 0, lang_dim = 0;         // 0 without language features
+  std::int64_t state_levels = 0, state_dim = 0;  // the same of the state decoder
+  std::string decoder_sha256, state_sha256;      // of the decoders, for the files of codes
   bool has_rgb = false;
   bool names_are_files = false;       // frames are image files whose names a COLMAP model can use
   std::int64_t expected_frames = -1;  // -1 if unknown
@@ -53,7 +60,8 @@ struct RunFrame {
 // The files a run leaves in its folder, but for run.json, and the folders with a file for each
 // frame.
 inline std::vector<std::string> run_files() {
-  return {"cameras.json",
+  return {kFieldFile,
+          "cameras.json",
           "contact_sheet.png",
           "sparse/0/cameras.txt",
           "sparse/0/images.txt",
@@ -62,9 +70,13 @@ inline std::vector<std::string> run_files() {
           "sparse"};
 }
 inline std::vector<std::string> run_folders() {
-  std::vector<std::string> folders{"points", "depth", "depth_color", "confidence", "rgb", "images"};
+  std::vector<std::string> folders{"points", "depth",  "depth_color", "confidence",
+                                   "rgb",    "images", "frames"};
+  for (const CodesKind kind : {CodesKind::kLanguage, CodesKind::kState})
+    folders.push_back(codes_folder(kind));
   for (const std::int64_t levels : {1, 3})
-    for (const std::string& level : level_names(levels)) folders.push_back("semantics_" + level);
+    for (const auto& names : {level_names(levels), state_level_names(levels)})
+      for (const std::string& level : names) folders.push_back("semantics_" + level);
   return folders;
 }
 
@@ -75,10 +87,13 @@ inline std::vector<std::string> run_folders() {
 //   confidence/NNNNNN.png, .json 16 bits and their scale
 //   rgb/NNNNNN.png               the RGB head's picture
 //   semantics_LEVEL/NNNNNN.png   semantic vectors as colours
+//   codes/NNNNNN.safetensors     the semantic vectors themselves; state_codes/ of the state decoder
+//   frames/NNNNNN.png            the picture the model saw
 //   images/NNNNNN.png            the original picture, if asked for
 //   cameras.json                 every frame's camera
 //   sparse/0/*.txt               COLMAP text model
 //   contact_sheet.png            some frames side by side
+//   field.json                   what all these hold, for LiftedField
 // NNNNNN counts the frames of the run from 0. A file appears only when it is complete.
 class RunWriter {
  public:
@@ -90,9 +105,17 @@ class RunWriter {
         outputs_(outputs),
         format_(format),
         keep_existing_(keep_existing),
-        level_names_(level_names(format.levels)),
+        level_names_(names_of(format.levels, level_names)),
+        map_names_(level_names_),
         cameras_(path("cameras.json"), format.transform),
         cloud_(format.transform.height, format.transform.width, format.levels, format.lang_dim) {
+    for (std::string& name : names_of(format.state_levels, state_level_names))
+      map_names_.push_back(std::move(name));
+    if (outputs.codes && format.levels > 0)
+      language_ = codes_format(level_names_, format.lang_dim, format.decoder_sha256);
+    if (outputs.codes && format.state_levels > 0)
+      states_ = codes_format(state_level_names(format.state_levels), format.state_dim,
+                             format.state_sha256);
     if (outputs.colmap) {
       make_folder("sparse");
       make_folder("sparse/0");
@@ -131,6 +154,11 @@ class RunWriter {
     cameras_.finish();
     if (colmap_) colmap_->finish();
     if (sheet_ && !sheet_->empty()) write_png(path("contact_sheet.png"), sheet_->render());
+    if (num_frames_ == 0) return;
+    write_file(
+        path(kFieldFile),
+        field_json({num_frames_, outputs_.every, format_.transform.height, format_.transform.width,
+                    outputs_.frames, outputs_.depth, outputs_.confidence, language_, states_}));
   }
 
   std::int64_t num_frames() const { return num_frames_; }                // complete
@@ -147,6 +175,16 @@ class RunWriter {
     if (error) fail(ErrorKind::kWrite, path(name), ": cannot create the folder: ", error.message());
   }
 
+  template <class Names>
+  static std::vector<std::string> names_of(std::int64_t levels, Names&& names) {
+    return levels > 0 ? names(levels) : std::vector<std::string>();
+  }
+
+  CodesFormat codes_format(const std::vector<std::string>& levels, std::int64_t dim,
+                           const std::string& sha256) const {
+    return {levels, format_.transform.height, format_.transform.width, dim, sha256};
+  }
+
   std::vector<std::string> output_folders() const {
     std::vector<std::string> names;
     if (outputs_.ply) names.push_back("points");
@@ -154,8 +192,11 @@ class RunWriter {
     if (outputs_.confidence) names.push_back("confidence");
     if (outputs_.rgb && format_.has_rgb) names.push_back("rgb");
     if (outputs_.semantics)
-      for (const std::string& level : level_names_) names.push_back("semantics_" + level);
+      for (const std::string& level : map_names_) names.push_back("semantics_" + level);
     if (outputs_.images) names.push_back("images");
+    if (outputs_.frames) names.push_back("frames");
+    if (language_) names.push_back(codes_folder(CodesKind::kLanguage));
+    if (states_) names.push_back(codes_folder(CodesKind::kState));
     return names;
   }
 
@@ -163,7 +204,7 @@ class RunWriter {
     std::vector<std::string> rows{"input"};
     if (format_.has_rgb) rows.push_back("RGB head");
     rows.insert(rows.end(), {"depth", "confidence"});
-    for (const std::string& level : level_names_) rows.push_back("semantics " + level);
+    for (const std::string& level : map_names_) rows.push_back("semantics " + level);
     return rows;
   }
 
@@ -171,16 +212,11 @@ class RunWriter {
     std::vector<View<const std::uint8_t, 3>> pictures{pictures_.input()};
     if (format_.has_rgb) pictures.push_back(pictures_.rgb());
     pictures.insert(pictures.end(), {pictures_.depth(), pictures_.confidence()});
-    for (std::size_t level = 0; level < level_names_.size(); ++level)
+    for (std::size_t level = 0; level < map_names_.size(); ++level)
       pictures.push_back(pictures_.semantics(level));
     std::string caption = "#" + std::to_string(frame.record.index) + "  ";
     append_number(caption, std::round(frame.record.timestamp * 100) / 100);
     sheet_->add(caption + " s", pictures);
-  }
-
-  static std::string stem(std::int64_t index) {
-    const std::string digits = std::to_string(index);
-    return std::string(digits.size() < 6 ? 6 - digits.size() : 0, '0') + digits;
   }
 
   // Calls write(path) unless the file is there already and is to be kept; false if stopped before.
@@ -198,7 +234,7 @@ class RunWriter {
   }
 
   bool write_files(const RunFrame& frame, const std::function<bool()>& stop, Context& ctx) {
-    const std::string png = "/" + stem(frame.record.index) + ".png";
+    const std::string png = "/" + frame_stem(frame.record.index) + ".png";
     const auto picture = [&](const std::string& folder, View<const std::uint8_t, 3> pixels) {
       return write_file_of_frame(folder + png, stop,
                                  [&](const std::string& file) { write_png(file, pixels); });
@@ -213,15 +249,28 @@ class RunWriter {
       return false;
     if (outputs_.rgb && format_.has_rgb && !picture("rgb", pictures_.rgb())) return false;
     if (outputs_.semantics)
-      for (std::size_t level = 0; level < level_names_.size(); ++level)
-        if (!picture("semantics_" + level_names_[level], pictures_.semantics(level))) return false;
+      for (std::size_t level = 0; level < map_names_.size(); ++level)
+        if (!picture("semantics_" + map_names_[level], pictures_.semantics(level))) return false;
     if (outputs_.images && !picture("images", frame.original)) return false;
+    if (outputs_.frames && !picture("frames", pictures_.input())) return false;
+    if (!write_codes_of(frame, CodesKind::kLanguage, language_, frame.maps.language, stop) ||
+        !write_codes_of(frame, CodesKind::kState, states_, frame.maps.states, stop))
+      return false;
     return write_points(frame, stop, ctx);
+  }
+
+  bool write_codes_of(const RunFrame& frame, CodesKind kind,
+                      const std::optional<CodesFormat>& format, View<const float, 4> codes,
+                      const std::function<bool()>& stop) {
+    if (!format) return true;
+    return write_file_of_frame(
+        codes_folder(kind) + ("/" + frame_stem(frame.record.index)) + ".safetensors", stop,
+        [&](const std::string& file) { write_codes(file, codes, *format, frame.record.index); });
   }
 
   bool write_map(const RunFrame& frame, const std::string& quantity, View<const float, 2> map,
                  const std::string& meaning, const std::function<bool()>& stop) {
-    const std::string file = quantity + "/" + stem(frame.record.index);
+    const std::string file = quantity + "/" + frame_stem(frame.record.index);
     return write_file_of_frame(file + ".png", stop, [&](const std::string& png) {
       write_depth_png(png, path(file + ".json"), map, quantity, meaning);
     });
@@ -238,7 +287,7 @@ class RunWriter {
       num_points_ += cloud_.size();
       const PlyPoints points{cloud_.positions(), cloud_.colors(), cloud_.confidence(),
                              cloud_.semantics(), level_names_,    frame.record.timestamp};
-      if (!write_file_of_frame("points/" + stem(frame.record.index) + ".ply", stop,
+      if (!write_file_of_frame("points/" + frame_stem(frame.record.index) + ".ply", stop,
                                [&](const std::string& file) { write_ply(file, points); }))
         return false;
     }
@@ -267,7 +316,7 @@ class RunWriter {
     }
     const std::string name = format_.names_are_files && !outputs_.images
                                  ? frame.record.name
-                                 : stem(frame.record.index) + ".png";
+                                 : frame_stem(frame.record.index) + ".png";
     colmap_->add_image(name, in_original_pixels(frame.record.camera, format_.transform),
                        format_.transform.original_width, format_.transform.original_height,
                        colmap_selection_);
@@ -277,7 +326,9 @@ class RunWriter {
   RunOutputs outputs_;
   RunFormat format_;
   bool keep_existing_;
-  std::vector<std::string> level_names_;
+  std::vector<std::string> level_names_;  // of the language
+  std::vector<std::string> map_names_;    // the same, then those of the states
+  std::optional<CodesFormat> language_, states_;
   CamerasJson cameras_;
   PointCloud cloud_;
   FramePictures pictures_;
