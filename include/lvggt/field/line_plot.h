@@ -29,7 +29,9 @@ struct Curve {
 struct PlotPanel {
   std::string title, x_label;
   std::vector<Curve> curves;
-  bool logarithmic = false;  // the y axis
+  bool logarithmic = false;                    // the y axis
+  std::vector<std::array<double, 2>> bands{};  // ranges of x that are shaded
+  Rgb8 band_color{214, 234, 214};
 };
 
 // Round numbers inside [low, high], about `count` of them: 1, 2 or 5 times a power of ten apart.
@@ -170,6 +172,7 @@ class LinePlot {
   }
 
   void draw_panel(View<std::uint8_t, 3> picture, const PlotPanel& panel, const Axes& axes) const {
+    for (const auto& band : panel.bands) draw_band(picture, axes, band, panel.band_color);
     draw_axes(picture, axes);
     draw_label(picture, kLeft, 8, panel.title, 1, kInk);
     draw_label(picture, (kLeft + width_ - kRight - label_width(panel.x_label, 1)) / 2,
@@ -198,6 +201,18 @@ class LinePlot {
     }
     draw_segment(picture, axes.left, axes.top, axes.left, axes.bottom, 0.5, kInk, 1);
     draw_segment(picture, axes.left, axes.bottom, axes.right, axes.bottom, 0.5, kInk, 1);
+  }
+
+  static void draw_band(View<std::uint8_t, 3> picture, const Axes& axes,
+                        const std::array<double, 2>& band, const Rgb8& color) {
+    const auto pixel = [&](double value) {
+      return static_cast<std::int64_t>(
+          std::lround(std::clamp(axes.x(value), axes.left, axes.right)));
+    };
+    for (auto row = static_cast<std::int64_t>(axes.top);
+         row < static_cast<std::int64_t>(axes.bottom); ++row)
+      for (std::int64_t column = pixel(band[0]); column <= pixel(band[1]); ++column)
+        std::copy(color.begin(), color.end(), &picture(row, column, 0));
   }
 
   static void draw_curve(View<std::uint8_t, 3> picture, const Axes& axes, const Curve& curve) {

@@ -21,6 +21,8 @@ struct PlyPoints {
   View<const float, 3> semantics;        // [N, level, d]; may be empty
   std::vector<std::string> level_names;  // one for each level
   double timestamp = 0;                  // seconds, the same for all points
+  // Each level is one number with a name of its own, not a semantic vector (d is 1).
+  bool plain_names = false;
 };
 
 namespace ply_detail {
@@ -57,8 +59,9 @@ inline std::string header(const PlyPoints& points, std::int64_t N) {
   if (points.semantics) {
     for (std::int64_t level = 0; level < points.semantics.extent(1); ++level) {
       for (std::int64_t k = 0; k < points.semantics.extent(2); ++k) {
-        text += "property float sem_" + points.level_names[static_cast<std::size_t>(level)] + "_";
-        append_number(text, k);
+        const std::string& name = points.level_names[static_cast<std::size_t>(level)];
+        text += "property float " + (points.plain_names ? name : "sem_" + name + "_");
+        if (!points.plain_names) append_number(text, k);
         text += '\n';
       }
     }
@@ -69,8 +72,8 @@ inline std::string header(const PlyPoints& points, std::int64_t N) {
 }  // namespace ply_detail
 
 // Writes a binary little-endian PLY: x y z (float), red green blue (uchar), conf and t (float),
-// then sem_<level>_<k> (float). t is the timestamp in seconds; it is in a comment too, with all its
-// digits. Errors: kMismatch for shapes that do not fit, kWrite.
+// then sem_<level>_<k> (float), or <level> where names are plain. t is the timestamp in seconds; it
+// is in a comment too, with all its digits. Errors: kMismatch for shapes that do not fit, kWrite.
 inline void write_ply(const std::string& path, const PlyPoints& points) {
   const std::int64_t N = points.positions.extent(0);
   const bool has_semantics = static_cast<bool>(points.semantics);
@@ -84,6 +87,8 @@ inline void write_ply(const std::string& path, const PlyPoints& points) {
                                      static_cast<std::int64_t>(points.level_names.size())),
               path, ": there are ", N, " points and ", points.level_names.size(),
               " levels, but semantics are ", points.semantics.shape());
+  LVGGT_CHECK(!points.plain_names || !has_semantics || points.semantics.extent(2) == 1, path,
+              ": numbers with plain names are ", points.semantics.shape());
 
   AtomicFile file(path);
   file.write(ply_detail::header(points, N));
