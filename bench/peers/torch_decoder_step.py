@@ -5,12 +5,15 @@
     torch_decoder_step.py [--batch N] [--steps N] [--threads N] [--channels-last]
 """
 import argparse
+import pathlib
 import resource
+import sys
 import time
 
 import torch
 
-from torch_decoder import Decoder, objective, optimiser
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[2] / "weights" / "pytorch"))
+from torch_decoder import Decoder, objective, optimiser  # noqa: E402
 
 
 def main():

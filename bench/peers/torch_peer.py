@@ -7,7 +7,7 @@
 """
 import json
 import os
-import os
+import pathlib
 import statistics
 import sys
 import time
@@ -15,6 +15,8 @@ import time
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
+
+sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[2] / "weights" / "pytorch"))
 
 
 def median_ms(run, seconds=1.0):

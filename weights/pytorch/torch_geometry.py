@@ -1,7 +1,9 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""The streaming geometry transformer in PyTorch, for comparison: frames one at a time, with the
-modules and parameter names of the published checkpoints, so that a state_dict fits either side."""
+"""The streaming geometry transformer in PyTorch: frames one at a time, or whole clips for training,
+with the modules and parameter names of the published checkpoints, so that a state_dict fits either
+side. For training the small model and for comparison; the engine does not need it."""
+import functools
 import math
 
 import torch
@@ -38,23 +40,24 @@ def rope_tables(positions, dim, base):
     return angles.cos().float(), angles.sin().float()
 
 
-def rotate(x, cos, sin):
-    a, b = x.chunk(2, -1)
-    return x * cos + torch.cat([-b, a], -1) * sin
-
-
 class Rope2d:
-    """Rotary embedding of the head's first half by the row, of its second half by the column."""
+    """Rotary embedding of the head's first half by the row, of its second half by the column.
+    frames > 1: for the tokens of so many frames in a row."""
 
-    def __init__(self, h, w, head_dim, base=100.0, special=5):
+    def __init__(self, h, w, head_dim, base=100.0, special=5, frames=1):
         rows, columns = torch.meshgrid(torch.arange(h) + 1, torch.arange(w) + 1, indexing="ij")
         zeros = torch.zeros(special, dtype=torch.long)
-        self.y = rope_tables(torch.cat([zeros, rows.flatten()]), head_dim // 2, base)
-        self.x = rope_tables(torch.cat([zeros, columns.flatten()]), head_dim // 2, base)
+        y = rope_tables(torch.cat([zeros, rows.flatten()]), head_dim // 2, base)
+        x = rope_tables(torch.cat([zeros, columns.flatten()]), head_dim // 2, base)
+        self.cos = torch.cat([y[0], x[0]], -1).repeat(frames, 1)
+        # Element k goes with k + a quarter of the head, in each half; the first gets a minus.
+        quarter = head_dim // 4
+        sign = torch.cat([-torch.ones(quarter), torch.ones(quarter)]).repeat(2)
+        self.sin = (torch.cat([y[1], x[1]], -1) * sign).repeat(frames, 1)
+        self.split = (2, 2, quarter)
 
     def __call__(self, t):
-        a, b = t.chunk(2, -1)
-        return torch.cat([rotate(a, *self.y), rotate(b, *self.x)], -1)
+        return t * self.cos + t.unflatten(-1, self.split).flip(-2).flatten(-3) * self.sin
 
 
 class Attention(nn.Module):
@@ -66,8 +69,9 @@ class Attention(nn.Module):
         self.k_norm = nn.LayerNorm(dim // heads, eps=1e-5) if qk_norm else nn.Identity()
         self.proj = nn.Linear(dim, dim)
 
-    def forward(self, x, rope=None, cache=None):
-        """x: [B, N, C]; cache: list of earlier (k, v), to which this call adds its own."""
+    def forward(self, x, rope=None, cache=None, mask=None):
+        """x: [B, N, C]; cache: list of earlier (k, v), to which this call adds its own; mask: [N, N],
+        added to the scores."""
         B, N, C = x.shape
         q, k, v = self.qkv(x).reshape(B, N, 3, self.heads, C // self.heads).permute(2, 0, 3, 1, 4)
         q, k = self.q_norm(q), self.k_norm(k)
@@ -76,7 +80,8 @@ class Attention(nn.Module):
         if cache is not None:
             cache.append((k, v))
             k, v = (torch.cat(parts, 2) for parts in zip(*cache))
-        weights = torch.softmax((q * q.shape[-1] ** -0.5) @ k.transpose(-2, -1), -1)
+        scores = (q * q.shape[-1] ** -0.5) @ k.transpose(-2, -1)
+        weights = torch.softmax(scores if mask is None else scores + mask, -1)
         return self.proj((weights @ v).transpose(1, 2).reshape(B, N, C))
 
 
@@ -90,8 +95,8 @@ class Block(nn.Module):
         self.mlp = Mlp(dim, int(dim * mlp_ratio))
         self.ls2 = LayerScale(dim, init_values)
 
-    def forward(self, x, rope=None, cache=None):
-        x = x + self.ls1(self.attn(self.norm1(x), rope, cache))
+    def forward(self, x, rope=None, cache=None, mask=None):
+        x = x + self.ls1(self.attn(self.norm1(x), rope, cache, mask))
         return x + self.ls2(self.mlp(self.norm2(x)))
 
 
@@ -161,6 +166,29 @@ class Aggregator(nn.Module):
             outputs.append(torch.cat([within, x], -1))
         return outputs
 
+    def clips(self, images, rope, frames_rope, mask):
+        """Whole clips, each frame seeing itself and those before. images: [B, S, 3, H, W];
+        frames_rope: of all S frames in a row; mask: frame_mask(S, P). Outputs [B, S, P, 2C]."""
+        B, S = images.shape[:2]
+        mean = torch.tensor(self.c["image_mean"])[:, None, None]
+        std = torch.tensor(self.c["image_std"])[:, None, None]
+        x = self.patch_embed((images.flatten(0, 1) - mean) / std).unflatten(0, (B, S))
+        which = torch.tensor([0] + [1] * (S - 1))
+        special = torch.cat([self.camera_token[:, which], self.register_token[:, which]], 2)
+        x = torch.cat([special.expand(B, -1, -1, -1), x], 2)
+        outputs, P = [], x.shape[2]
+        for frame_block, global_block in zip(self.frame_blocks, self.global_blocks):
+            within = frame_block(x.flatten(0, 1), rope).view(B, S, P, -1)
+            x = global_block(within.flatten(1, 2), frames_rope, None, mask).view(B, S, P, -1)
+            outputs.append(torch.cat([within, x], -1))
+        return outputs
+
+
+def frame_mask(frames, tokens):
+    """[N, N]: 0 where a token's frame may look, minus infinity at later frames."""
+    frame = torch.arange(frames).repeat_interleave(tokens)
+    return torch.zeros(len(frame), len(frame)).masked_fill(frame[:, None] < frame, -math.inf)
+
 
 class CameraHead(nn.Module):
     def __init__(self, c):
@@ -179,7 +207,7 @@ class CameraHead(nn.Module):
         self.iterations = c["cam_iterations"]
 
     def forward(self, token, caches=None):
-        """token: [1, 1, 2C]; caches: one list for each block of the trunk. Every iteration's encoding."""
+        """token: [B, 1, 2C]; caches: one list for each block of the trunk. Every iteration's encoding."""
         t = self.token_norm(token)
         encoding, results = None, []
         for _ in range(self.iterations):
@@ -194,6 +222,7 @@ class CameraHead(nn.Module):
         return results
 
 
+@functools.lru_cache(maxsize=64)
 def position_embedding(h, w, dim, aspect, ratio=0.1):
     """[dim, h, w]: sines and cosines of the place in the picture, u in the first half, v in the second."""
     diagonal = math.sqrt(aspect * aspect + 1)
@@ -241,6 +270,22 @@ class StreamVggt(nn.Module):
         if point_head:
             self.point_head = DptHead(c, 4)
         self.c = c
+
+    def clips(self, images):
+        """images: [B, S, 3, H, W] -> poses [B, S, iterations, 9] with the camera head's cache as in a
+        stream, depth and confidence [B, S, H, W], taps [B * S, h * w, 2C]."""
+        c, (B, S, _, H, W) = self.c, images.shape
+        h, w, special = H // c["patch_size"], W // c["patch_size"], 1 + c["num_register_tokens"]
+        head_dim = c["embed_dim"] // c["agg_heads"]
+        rope = Rope2d(h, w, head_dim, c["rope_freq"], special)
+        frames_rope = Rope2d(h, w, head_dim, c["rope_freq"], special, S)
+        outputs = self.aggregator.clips(images, rope, frames_rope, frame_mask(S, special + h * w))
+        caches = [[] for _ in self.camera_head.trunk]
+        poses = [torch.cat(self.camera_head(outputs[-1][:, s, :1], caches), 1) for s in range(S)]
+        taps = [outputs[i][:, :, special:].flatten(0, 1) for i in c["taps"]]
+        depth, confidence = self.depth_head(taps, h, w, (H, W))
+        return {"pose": torch.stack(poses, 1), "depth": depth.view(B, S, H, W),
+                "confidence": confidence.view(B, S, H, W), "taps": taps}
 
 
 class Stream:

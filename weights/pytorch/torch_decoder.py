@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""The Semantic Bridging Decoder and its objective in PyTorch, for comparison: the same layers under
+"""The Semantic Bridging Decoder and its objective in PyTorch: the same layers under
 the same names as in the published checkpoints, so that a state_dict fits either side."""
 import torch
 import torch.nn as nn
@@ -67,6 +67,8 @@ class ResidualConvUnit(nn.Module):
 
 
 class FusionBlock(nn.Module):
+    early_out_conv = False  # before the resize: the same function, cheaper
+
     def __init__(self, features, with_skip):
         super().__init__()
         self.out_conv = nn.Conv2d(features, features, 1)
@@ -78,6 +80,8 @@ class FusionBlock(nn.Module):
         if skip is not None:
             x = x + self.resConfUnit1(skip)
         x = self.resConfUnit2(x)
+        if self.early_out_conv:
+            return F.interpolate(self.out_conv(x), size, mode="bilinear", align_corners=True)
         return self.out_conv(F.interpolate(x, size, mode="bilinear", align_corners=True))
 
 

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The small model: its configuration, its starting weights, its objective, its files."""
+import json
+import math
+import os
+import pathlib
+import struct
+import sys
+
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+
+HERE = pathlib.Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent / "pytorch"))
+import torch_decoder  # noqa: E402
+from torch_geometry import StreamVggt  # noqa: E402
+
+# What the published configuration has and a smaller one need not repeat.
+DEFAULTS = {
+    "patch_size": 14, "mlp_ratio": 4, "num_register_tokens": 4, "dino_qk_norm": False, "dino_ln_eps": 1e-6,
+    "dino_init_values": 1.0, "agg_qk_norm": True, "agg_ln_eps": 1e-5, "agg_init_values": 1.0, "rope_freq": 100.0,
+    "cam_qk_norm": False, "cam_ln_eps": 1e-5, "cam_adaln_eps": 1e-6, "cam_iterations": 4,
+    "dpt_pos_embed_ratio": 0.1, "image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
+POSE_DISCOUNT = 0.6  # of an earlier iteration's error
+CELLS = 4            # the training's helper predicts so many values along each side of a patch
+
+
+def load_config(path=HERE / "config.json"):
+    return {**DEFAULTS, **json.loads(pathlib.Path(path).read_text())}
+
+
+def keep_variance(model):
+    """Weights with which a signal keeps its size through the layers. PyTorch's own shrink it to a half in
+    each, and nothing reaches the dense head's end, nor its gradient the encoder."""
+    after_relu = ("conv1", "conv2", "output_conv2.2")
+    for name, module in model.named_modules():
+        if isinstance(module, nn.ConvTranspose2d):  # stride = kernel: one tap for each input channel
+            module.weight.normal_(0, module.in_channels ** -0.5)
+        elif isinstance(module, (nn.Linear, nn.Conv2d)):
+            gain = 2 if name.endswith(after_relu) and "resConfUnit" in name or name.endswith("2.2") else 1
+            if name.endswith(("resConfUnit1.conv2", "resConfUnit2.conv2", "attn.proj", "mlp.fc2")):
+                gain *= 0.25  # ends of residual branches
+            module.weight.normal_(0, (gain / module.weight[0].numel()) ** 0.5)
+        else:
+            continue
+        if module.bias is not None:
+            module.bias.zero_()
+
+
+def make_model(config, seed):
+    torch.manual_seed(seed)
+    torch_decoder.FusionBlock.early_out_conv = True
+    model = StreamVggt(config)
+    a, c = model.aggregator, model.camera_head
+    with torch.no_grad():
+        keep_variance(model)
+    with torch.no_grad():
+        for token in (a.camera_token, a.register_token, a.patch_embed.cls_token, a.patch_embed.register_tokens,
+                      a.patch_embed.pos_embed):
+            token.normal_(0, 0.2)
+        # A still camera with a common field of view, and the mean distance everywhere.
+        c.pose_branch.fc2.weight.mul_(0.05)
+        c.pose_branch.fc2.bias.copy_(torch.tensor([0, 0, 0, 0, 0, 0, 0.3, 0.2, 0.27]))
+        last = model.depth_head.scratch.output_conv2[2]
+        last.weight.mul_(0.2)
+        last.bias.zero_()
+    return model
+
+
+class Helper(nn.Module):
+    """Only for training: reads depth, points in the first camera and the way back to the first frame
+    straight from the last layer's tokens, so that these learn before the dense head does."""
+
+    def __init__(self, config):
+        super().__init__()
+        self.read = nn.Linear(2 * config["embed_dim"], 6 * CELLS * CELLS)
+
+    def forward(self, tokens, h, w):
+        x = self.read(tokens).view(-1, h, w, 6, CELLS, CELLS).permute(0, 3, 1, 4, 2, 5)
+        return x.reshape(-1, 6, h * CELLS, w * CELLS)
+
+    def loss(self, tokens, batch):
+        B, S, H, W = batch["depth"].shape
+        h, w = H // 14, W // 14
+        out = self(tokens, h, w)
+
+        def pooled(x):
+            return F.adaptive_avg_pool2d(x.flatten(0, 1), (h * CELLS, w * CELLS))
+
+        log_depth = pooled(batch["depth"].log()[:, :, None])
+        points = pooled(batch["points"].permute(0, 1, 4, 2, 3))
+        tangent = (batch["pose"][:, :, None, None, 7:9] / 2).tan().flip(-1)  # width, height
+        where = batch["points"][..., :2] / batch["points"][..., 2:].clamp(min=0.05) / tangent
+        u = (torch.arange(W) + 0.5) / W * 2 - 1
+        v = (torch.arange(H) + 0.5) / H * 2 - 1
+        here = torch.stack(torch.broadcast_tensors(u[None, :], v[:, None]), -1)
+        back = pooled((where - here).clamp(-1.5, 1.5).permute(0, 1, 4, 2, 3))
+        distance = points.norm(dim=1, keepdim=True).clamp(min=0.1)
+        return ((out[:, :1] - log_depth).abs().mean() + ((out[:, 1:4] - points).abs() / distance).mean()
+                + 2 * (out[:, 4:] - back).abs().mean())
+
+
+def gradient_error(error):
+    """How unevenly the error lies, over three scales."""
+    total = 0
+    for step in (1, 2, 4):
+        e = error[..., ::step, ::step]
+        total = total + e.diff(dim=-1).abs().mean() + e.diff(dim=-2).abs().mean()
+    return total / 3
+
+
+def objective(out, batch):
+    """The loss and its terms."""
+    error = out["depth"].log() - batch["depth"].log()
+    absolute = error.abs()
+    depth = absolute.mean()
+    gradient = gradient_error(error)
+    # Its best value is 1 / error; it learns from the error and does not weigh it.
+    confidence = (out["confidence"] * absolute.detach() - out["confidence"].log()).mean()
+    wanted = batch["pose"][:, :, None]
+    weight = POSE_DISCOUNT ** torch.arange(out["pose"].shape[2] - 1, -1, -1.0)
+    off = ((out["pose"] - wanted).abs().mean((0, 1)) * weight[:, None]).sum(0) / weight.sum()
+    shift, turn, view = off[:3].mean(), off[3:7].mean(), off[7:].mean()
+    loss = depth + 0.5 * gradient + 0.05 * confidence + 3 * shift + 6 * turn + view
+    return loss, {"depth": depth, "gradient": gradient, "confidence": confidence, "shift": shift, "turn": turn,
+                  "view": view}
+
+
+def write_safetensors(path, tensors, metadata):
+    """tensors: name -> float32 or bfloat16 tensor. Appears under its name only when complete."""
+    kinds = {torch.float32: "F32", torch.bfloat16: "BF16", torch.int64: "I64"}
+    header, offset, parts = {"__metadata__": metadata}, 0, []
+    for name in sorted(tensors):
+        t = tensors[name].detach().contiguous()
+        raw = (t.view(torch.int16) if t.dtype == torch.bfloat16 else t).numpy().tobytes()
+        header[name] = {"dtype": kinds[t.dtype], "shape": list(t.shape), "data_offsets": [offset, offset + len(raw)]}
+        offset += len(raw)
+        parts.append(raw)
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    unfinished = f"{path}.tmp"
+    with open(unfinished, "wb") as file:
+        file.write(struct.pack("<Q", len(text)) + text + b"".join(parts))
+    os.replace(unfinished, path)
+
+
+def read_safetensors(path):
+    """name -> float32 tensor, and the metadata."""
+    data = pathlib.Path(path).read_bytes()
+    size = struct.unpack("<Q", data[:8])[0]
+    header = json.loads(data[8:8 + size])
+    metadata, tensors = header.pop("__metadata__", {}), {}
+    kinds = {"F32": torch.float32, "BF16": torch.bfloat16}
+    for name, entry in header.items():
+        begin, end = entry["data_offsets"]
+        raw = torch.frombuffer(bytearray(data[8 + size + begin:8 + size + end]), dtype=kinds[entry["dtype"]])
+        tensors[name] = raw.float().view(entry["shape"])
+    return tensors, metadata
+
+
+def count(model):
+    return sum(math.prod(p.shape) for p in model.parameters())

@@ -1,0 +1,207 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Trains the small model on scenes rendered as it goes. Interrupted, it continues with --resume.
+
+  train.py RUN --stage 56x84:14x2,7x4:3000:7e-4 --stage 112x154:8x2,4x4:60m:3e-4
+
+A stage: the frames' size; the kinds of batches, taken in turns, clips x frames; how many steps, or minutes; the
+learning rate, which falls to a twentieth by half a cosine. Half of a batch's clips are new, half were new a few
+steps before and come back mirrored and backwards. RUN gets checkpoint.pt (every few minutes, the weights' running
+average included), log.jsonl (losses and scores), arguments.json.
+"""
+import argparse
+import collections
+import json
+import math
+import os
+import pathlib
+import signal
+import sys
+import time
+
+import torch
+
+import evaluate
+import model as small
+import scenes
+
+TRAIN_SEED = 10_000_000      # batch k of stage s: TRAIN_SEED * (s + 1) + 64 k
+HELD_OUT_SEED = 900_000_000  # never trained on
+AVERAGE = 0.998              # of the running average of the weights
+
+
+class Stage:
+    def __init__(self, text):
+        size, kinds, steps, rate = text.split(":")
+        self.height, self.width = map(int, size.split("x"))
+        self.kinds = [tuple(map(int, kind.split("x"))) for kind in kinds.split(",")]
+        self.minutes = float(steps[:-1]) if steps.endswith("m") else 0
+        self.steps, self.rate = 0 if self.minutes else int(steps), float(rate)
+
+    def plan(self, k):
+        clips, frames = self.kinds[k % len(self.kinds)]
+        return (clips + 1) // 2, frames, self.height, self.width
+
+    def done(self, k, seconds):
+        """The part of the stage that k steps and so many seconds are."""
+        return seconds / 60 / self.minutes if self.minutes else k / self.steps
+
+    def learning_rate(self, k, done, warm=100):
+        fall = 0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * min(done, 1)))
+        return self.rate * fall * min(1, (k + 1) / warm)
+
+
+class Recent:
+    """Clips seen a few steps before, to be seen once more, mirrored and backwards."""
+
+    def __init__(self, kinds):
+        self.queues, self.kinds, self.turn = [collections.deque() for _ in range(kinds)], kinds, 0
+
+    def add_old(self, fresh, clips):
+        queue = self.queues[self.turn % self.kinds]
+        self.turn += 1
+        old = queue.popleft() if len(queue) >= 6 else []
+        queue.append(fresh)
+        return fresh + [scenes.mirrored(clip) for clip in old[:clips - len(fresh)]]
+
+
+class Run:
+    def __init__(self, args):
+        self.folder = pathlib.Path(args.run)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.stages = [Stage(text) for text in args.stage]
+        self.config = small.load_config(args.config)
+        self.model = small.make_model(self.config, args.seed)
+        self.helper = small.Helper(self.config)
+        self.average = small.make_model(self.config, args.seed)
+        self.dense = [*self.model.aggregator.parameters(), *self.model.depth_head.parameters()]
+        groups = {True: [], False: []}
+        for p in [*self.model.parameters(), *self.helper.parameters()]:
+            groups[p.ndim > 1].append(p)
+        self.optimiser = torch.optim.AdamW([{"params": groups[True], "weight_decay": 0.02},
+                                            {"params": groups[False], "weight_decay": 0.0}],
+                                           lr=0, betas=(0.9, 0.98), foreach=True)
+        self.stage, self.step, self.total, self.spent, self.stop = 0, 0, 0, 0.0, False
+        self.save_every, self.score_every = 60 * args.save_minutes, args.score_every
+        if args.resume:
+            self.load()
+        elif (self.folder / "checkpoint.pt").exists():
+            sys.exit(f"train.py: {self.folder} has a checkpoint; --resume continues it")
+        if args.start_from:
+            weights = torch.load(args.start_from)["average"]
+            self.model.load_state_dict(weights)
+            self.average.load_state_dict(weights)
+        (self.folder / "arguments.json").write_text(json.dumps(vars(args), indent=1))
+
+    def say(self, **entry):
+        with open(self.folder / "log.jsonl", "a") as file:
+            file.write(json.dumps(entry) + "\n")
+        print(json.dumps(entry), flush=True)
+
+    def state(self):
+        return {"model": self.model.state_dict(), "average": self.average.state_dict(),
+                "helper": self.helper.state_dict(), "optimiser": self.optimiser.state_dict(),
+                "stage": self.stage, "step": self.step, "total": self.total, "spent": self.spent}
+
+    def save(self):
+        path = self.folder / "checkpoint.pt"
+        torch.save(self.state(), f"{path}.tmp")
+        os.replace(f"{path}.tmp", path)
+
+    def load(self):
+        state = torch.load(self.folder / "checkpoint.pt")
+        for name in ("model", "average", "helper", "optimiser"):
+            getattr(self, name).load_state_dict(state[name])
+        self.stage, self.step, self.total, self.spent = (state[k] for k in ("stage", "step", "total", "spent"))
+
+    def one_step(self, clips, rate):
+        batch = {k: torch.from_numpy(v) for k, v in scenes.targets(clips).items() if v.dtype == "float32"}
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        out = self.model.clips(batch["images"])
+        loss, terms = small.objective(out, batch)
+        terms["helper"] = self.helper.loss(out["taps"][-1], batch)
+        self.optimiser.zero_grad(set_to_none=True)
+        (loss + 0.5 * terms["helper"]).backward()
+        # Apart, because the camera head's iterations make its gradients far larger.
+        norm = torch.nn.utils.clip_grad_norm_(self.dense, 1.0)
+        norm = norm + torch.nn.utils.clip_grad_norm_(self.model.camera_head.parameters(), 1.0)
+        if not math.isfinite(norm):
+            raise RuntimeError(f"the gradient of step {self.total} is not finite")
+        self.optimiser.step()
+        self.total += 1
+        decay = min(AVERAGE, self.total / (self.total + 20))
+        with torch.no_grad():
+            mean = list(self.average.parameters())
+            torch._foreach_mul_(mean, decay)
+            torch._foreach_add_(mean, list(self.model.parameters()), alpha=1 - decay)
+        return {**{k: float(v) for k, v in terms.items()}, "loss": float(loss), "norm": float(norm)}
+
+    def score(self, stage, generator):
+        scores = evaluate.score_rendered(self.average, generator, HELD_OUT_SEED, 32, 4, stage.height, stage.width)
+        self.say(step=self.total, stage=self.stage, held_out={k: round(v, 4) for k, v in scores.items()})
+
+    def run_stage(self, stage, generator):
+        """To its end, or until asked to stop."""
+        fresh = scenes.Batches(generator, stage.plan, TRAIN_SEED * (self.stage + 1), self.step)
+        recent, sums, begin, clock = Recent(len(stage.kinds)), {}, time.time(), time.time()
+        while stage.done(self.step, self.spent) < 1 and not self.stop:
+            rate = stage.learning_rate(self.step, stage.done(self.step, self.spent))
+            clips = recent.add_old(next(fresh), stage.kinds[self.step % len(stage.kinds)][0])
+            for k, v in self.one_step(clips, rate).items():
+                sums.setdefault(k, []).append(v)
+            self.step += 1
+            if self.step % 20 == 0:
+                means = {k: round(sum(v) / len(v), 4) for k, v in sums.items()}
+                self.say(step=self.total, stage=self.stage, rate=round(rate, 7), **means,
+                         seconds=round((time.time() - begin) / len(sums["loss"]), 3), time=round(time.time()))
+                sums, begin = {}, time.time()
+            if self.step % self.score_every == 0:
+                self.score(stage, generator)
+                begin = time.time()
+            self.spent += time.time() - clock
+            clock = time.time()
+            if clock - self.saved > self.save_every:
+                self.save()
+                self.saved = time.time()
+
+    def train(self, generator):
+        self.saved = time.time()
+        while self.stage < len(self.stages) and not self.stop:
+            stage = self.stages[self.stage]
+            self.run_stage(stage, generator)
+            if self.stop:
+                break
+            self.score(stage, generator)
+            torch.save(self.state(), self.folder / f"stage{self.stage}.pt")
+            self.stage, self.step, self.spent = self.stage + 1, 0, 0.0
+            self.save()
+        self.save()
+
+
+def main():
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("run")
+    arguments.add_argument("--stage", action="append", required=True)
+    arguments.add_argument("--config", default=str(small.HERE / "config.json"))
+    arguments.add_argument("--seed", type=int, default=1)
+    arguments.add_argument("--threads", type=int, default=2)
+    arguments.add_argument("--resume", action="store_true")
+    arguments.add_argument("--start-from", help="another run's checkpoint: only its averaged weights")
+    arguments.add_argument("--save-minutes", type=float, default=3)
+    arguments.add_argument("--score-every", type=int, default=500)
+    args = arguments.parse_args()
+    torch.set_num_threads(args.threads)
+    run = Run(args)
+
+    def ask_to_stop(*_):
+        run.stop = True
+
+    signal.signal(signal.SIGTERM, ask_to_stop)
+    signal.signal(signal.SIGINT, ask_to_stop)
+    run.say(values=small.count(run.model), stages=args.stage, resumed_at=run.total)
+    run.train(scenes.Generator())
+
+
+if __name__ == "__main__":
+    main()
