@@ -10,6 +10,7 @@
 
 #include "lvggt/core/error.h"
 #include "lvggt/model/tensor_list.h"
+#include "tests/support/paths.h"
 
 namespace {
 
@@ -38,7 +39,7 @@ std::int64_t total_values(const ModelConfig& config) {
   return total;
 }
 
-ModelConfig tiny() { return lvggt::load_config(LVGGT_TEST_DATA "/golden/config_tiny.json"); }
+ModelConfig tiny() { return lvggt::load_config(lvggt::test::test_data("golden/config_tiny.json")); }
 
 }  // namespace
 
@@ -112,8 +113,8 @@ TEST_CASE("tensor_list: the published configuration has 1,219,050,724 values") {
 }
 
 TEST_CASE("tensor_list: names and shapes of the reference checkpoint, no more and no fewer") {
-  std::ifstream file(LVGGT_TEST_DATA
-                     "/golden/tensors_tiny.txt");  // one `name extent,extent,...` a line
+  std::ifstream file(
+      lvggt::test::test_data("golden/tensors_tiny.txt"));  // one `name extent,extent,...` a line
   std::map<std::string, std::string> expected;
   for (std::string name, shape; file >> name >> shape;) expected[name] = shape;
   REQUIRE(expected.size() == 689);

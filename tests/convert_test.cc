@@ -8,6 +8,7 @@
 #include <string>
 #include <vector>
 
+#include "tests/support/paths.h"
 #include "tests/support/safetensors_bytes.h"
 
 using lvggt::convert_weights;
@@ -23,7 +24,7 @@ using lvggt::test::TempDir;
 
 namespace {
 
-const std::string kGolden = std::string(LVGGT_TEST_DATA) + "/golden/";
+const std::string kGolden = lvggt::test::test_data("golden/");
 
 ConvertResult convert(const std::string& in, const std::string& out,
                       const ConvertOptions& options = {}) {

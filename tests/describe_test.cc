@@ -8,6 +8,7 @@
 
 #include "lvggt/io/json.h"
 #include "lvggt/model/tensor_list.h"
+#include "tests/support/paths.h"
 #include "tests/support/safetensors_bytes.h"
 
 using lvggt::describe_weights;
@@ -105,7 +106,7 @@ TEST_CASE(
 
 TEST_CASE("describe_weights: a checkpoint of something else is said to be unknown") {
   const WeightsDescription d =
-      describe_weights(std::string(LVGGT_TEST_DATA) + "/golden/checkpoint_nested.pth");
+      describe_weights(lvggt::test::test_data("golden/checkpoint_nested.pth"));
   CHECK(d.format == "PyTorch checkpoint");
   CHECK(d.contents.find("nothing lvggt knows") != std::string::npos);
   CHECK(d.notes.size() == 2);

@@ -8,13 +8,14 @@
 #include "lvggt/geometry/camera.h"
 #include "lvggt/geometry/unproject.h"
 #include "lvggt/io/safetensors.h"
+#include "tests/support/paths.h"
 
 using namespace lvggt;
 
 namespace {
 
 Safetensors golden() {
-  return Safetensors::open(LVGGT_TEST_DATA "/golden/ops_tiny_seed1.safetensors");
+  return Safetensors::open(lvggt::test::test_data("golden/ops_tiny_seed1.safetensors"));
 }
 
 // Rounding of the reference itself, which computes in float: a few units in the last place of

@@ -12,6 +12,7 @@
 #include "lvggt/model/tensor_list.h"
 #include "tests/support/child_process.h"
 #include "tests/support/files.h"
+#include "tests/support/paths.h"
 #include "tests/support/tiny_scene.h"
 
 using namespace lvggt;
@@ -47,10 +48,18 @@ class Videos {
 
   std::vector<std::string> command(const std::string& out,
                                    const std::vector<std::string>& more = {}) const {
-    std::vector<std::string> argv{
-        LVGGT_LIFT_VIDEO, "--list",   dir_ / "list.txt", "--weights", dir_ / "model.safetensors",
-        "--mode",         "original", "--threads",       "1",         "--no-ply",
-        "--out",          dir_ / out};
+    std::vector<std::string> argv{lvggt::test::program("lift_video"),
+                                  "--list",
+                                  dir_ / "list.txt",
+                                  "--weights",
+                                  dir_ / "model.safetensors",
+                                  "--mode",
+                                  "original",
+                                  "--threads",
+                                  "1",
+                                  "--no-ply",
+                                  "--out",
+                                  dir_ / out};
     argv.insert(argv.end(), more.begin(), more.end());
     return argv;
   }

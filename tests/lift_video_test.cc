@@ -16,6 +16,7 @@
 #include "lvggt/io/png.h"
 #include "tests/support/child_process.h"
 #include "tests/support/files.h"
+#include "tests/support/paths.h"
 #include "tests/support/temp_dir.h"
 #include "tests/support/tiny_model.h"
 
@@ -39,14 +40,14 @@ Result finish(test::ChildProcess& child) {
 class Scene {
  public:
   explicit Scene(int num_frames = 3) {
-    init({"--config", LVGGT_TEST_DATA "/golden/config_tiny.json", "--seed", "1",
+    init({"--config", lvggt::test::test_data("golden/config_tiny.json"), "--seed", "1",
           dir_ / "model.safetensors"});
     fs::create_directory(dir_ / "frames");
     for (int i = 0; i < num_frames; ++i) add_picture("img" + std::to_string(i) + ".png", 56, 84, i);
   }
 
   void init(std::vector<std::string> arguments) {
-    arguments.insert(arguments.begin(), LVGGT_WEIGHTS_INIT);
+    arguments.insert(arguments.begin(), lvggt::test::program("weights_init"));
     test::ChildProcess child(arguments);
     const Result result = finish(child);
     INFO(result.err);
@@ -66,11 +67,16 @@ class Scene {
 
   // The command: frames to "out" with the model in one file, and more options.
   std::vector<std::string> command(const std::vector<std::string>& more = {}) const {
-    std::vector<std::string> argv{LVGGT_LIFT_VIDEO, dir_ / "frames",
-                                  "--weights",      dir_ / "model.safetensors",
-                                  "--out",          dir_ / "out",
-                                  "--mode",         "original",
-                                  "--threads",      "2"};
+    std::vector<std::string> argv{lvggt::test::program("lift_video"),
+                                  dir_ / "frames",
+                                  "--weights",
+                                  dir_ / "model.safetensors",
+                                  "--out",
+                                  dir_ / "out",
+                                  "--mode",
+                                  "original",
+                                  "--threads",
+                                  "2"};
     argv.insert(argv.end(), more.begin(), more.end());
     return argv;
   }
@@ -80,7 +86,7 @@ class Scene {
   }
   // With the whole argument list.
   Result run(std::vector<std::string> arguments) const {
-    arguments.insert(arguments.begin(), LVGGT_LIFT_VIDEO);
+    arguments.insert(arguments.begin(), lvggt::test::program("lift_video"));
     test::ChildProcess child(arguments);
     return finish(child);
   }
@@ -161,7 +167,7 @@ TEST_CASE(
     "lift_video: one file or two, one thread or three give the same bytes; geometry alone is "
     "said") {
   Scene scene;
-  scene.init({"--config", LVGGT_TEST_DATA "/golden/config_tiny.json", "--seed", "1",
+  scene.init({"--config", lvggt::test::test_data("golden/config_tiny.json"), "--seed", "1",
               "--decoder-out", scene / "decoder.safetensors", scene / "geometry.safetensors"});
   REQUIRE(scene.lift().status == 0);
   const auto lift = [&](const std::string& out, std::vector<std::string> more) {
@@ -188,8 +194,8 @@ TEST_CASE(
 
 TEST_CASE("lift_video: a decoder, a state decoder or both run on one pass of the geometry") {
   Scene scene(2);
-  ModelConfig config = load_config(LVGGT_TEST_DATA "/golden/config_tiny.json");
-  scene.init({"--config", LVGGT_TEST_DATA "/golden/config_tiny.json", "--seed", "1",
+  ModelConfig config = load_config(lvggt::test::test_data("golden/config_tiny.json"));
+  scene.init({"--config", lvggt::test::test_data("golden/config_tiny.json"), "--seed", "1",
               "--decoder-out", scene / "decoder.safetensors", scene / "geometry.safetensors"});
   config.sbd_levels = 1;
   config.lang_dim = 6;
@@ -232,7 +238,7 @@ TEST_CASE("lift_video: a decoder, a state decoder or both run on one pass of the
 
 TEST_CASE("lift_video: a state decoder of another model, or none, is refused by name") {
   Scene scene(1);
-  ModelConfig config = load_config(LVGGT_TEST_DATA "/golden/config_tiny.json");
+  ModelConfig config = load_config(lvggt::test::test_data("golden/config_tiny.json"));
   config.sbd_levels = 1;
   config.taps[3] -= 1;
   test::write_tensors(scene / "other.safetensors", decoder_tensors(config), &config);
@@ -433,7 +439,7 @@ TEST_CASE(
 
 TEST_CASE("C21: a video that ends early gives the frames there are, status 5, and says so") {
   const Scene scene(0);
-  const std::string clip = test::read_bytes(LVGGT_TEST_DATA "/../examples/data/cup_24.mp4");
+  const std::string clip = test::read_bytes(lvggt::test::test_data("../examples/data/cup_24.mp4"));
   test::write_bytes(scene / "cut.mp4", clip.substr(0, clip.size() / 3));
   const Result result = scene.run({scene / "cut.mp4", "--weights", scene / "model.safetensors",
                                    "--out", scene / "out", "--size", "84", "--no-ply", "--no-depth",

@@ -18,6 +18,7 @@
 #include "lvggt/io/safetensors.h"
 #include "tests/support/child_process.h"
 #include "tests/support/files.h"
+#include "tests/support/paths.h"
 #include "tests/support/tiny_scene.h"
 
 using namespace lvggt;
@@ -48,8 +49,13 @@ const std::string& weights() {
 }
 
 std::vector<std::string> command(const std::vector<std::string>& more) {
-  std::vector<std::string> argv{LVGGT_MAKE_TOKENS, "--weights", weights(), "--mode",
-                                "original",        "--threads", "1"};
+  std::vector<std::string> argv{lvggt::test::program("make_tokens"),
+                                "--weights",
+                                weights(),
+                                "--mode",
+                                "original",
+                                "--threads",
+                                "1"};
   argv.insert(argv.end(), more.begin(), more.end());
   return argv;
 }
@@ -130,8 +136,8 @@ TEST_CASE("make_tokens: a folder of images and a video are inputs too, with --ou
   CHECK(run({tiny.images()}).status == 2);
   REQUIRE(run({tiny.images(), "--out", tiny / "a"}).status == 0);
   CHECK(fs::exists(tiny / "a/000002.safetensors"));
-  const Result video = run({LVGGT_TEST_DATA "/../examples/data/cup_24.mp4", "--out", tiny / "b",
-                            "--max-frames", "3", "--stride", "2"});
+  const Result video = run({lvggt::test::test_data("../examples/data/cup_24.mp4"), "--out",
+                            tiny / "b", "--max-frames", "3", "--stride", "2"});
   INFO(video.err);
   REQUIRE(video.status == 0);
   CHECK(fs::exists(tiny / "b/000004.safetensors"));

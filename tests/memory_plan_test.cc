@@ -13,6 +13,7 @@
 #include "lvggt/model/config.h"
 #include "tests/support/child_process.h"
 #include "tests/support/files.h"
+#include "tests/support/paths.h"
 #include "tests/support/sanitizer.h"
 #include "tests/support/temp_dir.h"
 
@@ -37,7 +38,7 @@ Result run(const std::vector<std::string>& argv) {
 class Lab {
  public:
   Lab() {
-    ModelConfig config = load_config(LVGGT_TEST_DATA "/golden/config_tiny.json");
+    ModelConfig config = load_config(test_data("golden/config_tiny.json"));
     write_model("tiny", config);
     config.embed_dim = 384;  // 19 M weights in the blocks and the camera head
     config.dino_heads = config.agg_heads = config.cam_heads = 6;
@@ -45,7 +46,7 @@ class Lab {
     config.taps = {0, 0, 1, 1};
     config.cam_trunk_depth = 1;
     write_model("wide", config);
-    REQUIRE(run({LVGGT_WEIGHTS_QUANTIZE, path("wide"), path("int8")}).status == 0);
+    REQUIRE(run({program("weights_quantize"), path("wide"), path("int8")}).status == 0);
     write_pictures("small", 16, 196, 196);
     write_pictures("large", 2, 588, 784);
   }
@@ -54,7 +55,7 @@ class Lab {
   void check(const std::string& model, const std::string& pictures,
              std::vector<std::string> options) const {
     options.insert(options.begin(),
-                   {LVGGT_LIFT_VIDEO, dir_ / pictures, "--weights", path(model), "--mode",
+                   {program("lift_video"), dir_ / pictures, "--weights", path(model), "--mode",
                     "original", "--out", dir_ / "out", "--force", "--summary", "-"});
     const Result result = run(options);
     CAPTURE(result.err);
@@ -67,15 +68,16 @@ class Lab {
     CAPTURE(planned / 0x1p20);
     CAPTURE(peak / 0x1p20);
     CHECK(peak > 40 * 0x1p20);
-    // Within a tenth where this was tuned; huge pages, which the system gives or not, move the peak.
+    // Within a tenth where this was tuned; huge pages, which the system gives or not, move the
+    // peak.
     CHECK(planned > 0.85 * peak);
     CHECK(planned < 1.15 * peak);
     MESSAGE("planned ", planned / 0x1p20, " peak ", peak / 0x1p20, " ratio ", planned / peak);
   }
 
   Result dry_run(std::vector<std::string> options) const {
-    options.insert(options.begin(), {LVGGT_LIFT_VIDEO, dir_ / "small", "--weights", path("wide"),
-                                     "--mode", "original", "--dry-run"});
+    options.insert(options.begin(), {program("lift_video"), dir_ / "small", "--weights",
+                                     path("wide"), "--mode", "original", "--dry-run"});
     return run(options);
   }
 
@@ -84,7 +86,8 @@ class Lab {
 
   void write_model(const std::string& name, const ModelConfig& config) {
     write_bytes(dir_ / "config.json", to_json(config));
-    REQUIRE(run({LVGGT_WEIGHTS_INIT, "--config", dir_ / "config.json", path(name)}).status == 0);
+    REQUIRE(run({program("weights_init"), "--config", dir_ / "config.json", path(name)}).status ==
+            0);
   }
 
   void write_pictures(const std::string& folder, int count, std::int64_t H, std::int64_t W) {

@@ -9,6 +9,7 @@
 #include "lvggt/io/input_file.h"
 #include "lvggt/io/safetensors.h"
 #include "lvggt/model/tensor_list.h"
+#include "tests/support/paths.h"
 
 TEST_CASE("names.tsv: the table of published tensors is what the loader expects") {
   std::ostringstream expected;
@@ -19,6 +20,5 @@ TEST_CASE("names.tsv: the table of published tensors is what the loader expects"
   for (const auto& spec : lvggt::decoder_tensors(config))
     expected << spec.name << "\tF32\t" << lvggt::shape_text(spec.shape) << "\tdecoder\n";
   // Made by: weights_init --list > weights/names.tsv
-  CHECK(lvggt::read_text_file(std::string(LVGGT_TEST_DATA) + "/../weights/names.tsv") ==
-        expected.str());
+  CHECK(lvggt::read_text_file(lvggt::test::test_data("../weights/names.tsv")) == expected.str());
 }

@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "lvggt/core/float16.h"
+#include "tests/support/paths.h"
 #include "tests/support/pth_bytes.h"
 #include "tests/support/safetensors_bytes.h"
 
@@ -26,7 +27,7 @@ using lvggt::test::write_zip;
 
 namespace {
 
-const std::string kGolden = std::string(LVGGT_TEST_DATA) + "/golden/";
+const std::string kGolden = lvggt::test::test_data("golden/");
 
 const lvggt::PthTensor& tensor_named(const PthFile& file, const std::string& name) {
   for (const auto& tensor : file.tensors())

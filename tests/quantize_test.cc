@@ -11,6 +11,7 @@
 #include "lvggt/io/json.h"
 #include "lvggt/model/quantized_linear.h"
 #include "tests/support/child_process.h"
+#include "tests/support/paths.h"
 #include "tests/support/tiny_model.h"
 #include "weights/sensitivity.h"
 
@@ -43,7 +44,7 @@ struct Source {
     write_tensors(model, all_tensors(config), &config);
   }
   Result quantize(const std::string& out, std::vector<std::string> more = {}) const {
-    more.insert(more.begin(), {LVGGT_WEIGHTS_QUANTIZE, model, dir / out});
+    more.insert(more.begin(), {program("weights_quantize"), model, dir / out});
     return run(more);
   }
 };
@@ -133,7 +134,7 @@ TEST_CASE("weights_quantize: types by kind, scales, metadata, sizes") {
 
 TEST_CASE("weights_quantize: a plan prints sizes and writes nothing") {
   const Source source;
-  const Result plan = run({LVGGT_WEIGHTS_QUANTIZE, "--dry-run", source.model});
+  const Result plan = run({program("weights_quantize"), "--dry-run", source.model});
   CHECK(plan.status == 0);
   CHECK(contains(plan.out, "global.fc2"));
   CHECK(contains(plan.out, "would become"));
@@ -152,10 +153,10 @@ TEST_CASE("weights_quantize: what cannot be done is refused, and nothing is writ
   fault(source.quantize("x", {"--kind", "dino"}), 2, "KIND=TYPE");
   fault(source.quantize("x", {"--kind", "dino=int4"}), 2, "int4");
   fault(source.quantize("x", {"--storage", "int4"}), 2, "int4");
-  fault(run({LVGGT_WEIGHTS_QUANTIZE, source.model}), 2, "missing");
+  fault(run({program("weights_quantize"), source.model}), 2, "missing");
   fault(source.quantize("model.safetensors"), 2, "--force");
   REQUIRE(source.quantize("int8").status == 0);
-  fault(run({LVGGT_WEIGHTS_QUANTIZE, source.dir / "int8", source.dir / "x"}), 3,
+  fault(run({program("weights_quantize"), source.dir / "int8", source.dir / "x"}), 3,
         "quantised already");
   write_tensors(source.model, all_tensors(tiny_config()), nullptr, [](WeightTensor& tensor) {
     if (tensor.name == "camera_head.pose_branch.fc2.weight") tensor.values[2] = 1e6f;
@@ -168,15 +169,15 @@ TEST_CASE("weights_quantize: what cannot be done is refused, and nothing is writ
 TEST_CASE("quantised files: the other programs say what they are and what becomes of them") {
   const Source source;
   REQUIRE(source.quantize("int8").status == 0);
-  const Result info = run({LVGGT_WEIGHTS_INFO, "--check", source.dir / "int8"});
+  const Result info = run({program("weights_info"), "--check", source.dir / "int8"});
   CHECK(contains(info.out, "I8 in"));
   CHECK(contains(info.out, "quantization = int8 per output channel"));
   CHECK(contains(info.out, "every tensor that it needs is there"));
   CHECK(contains(info.out, "all finite, none suspicious"));
 
-  const std::string golden = LVGGT_TEST_DATA "/golden/square56_tiny_seed1.safetensors";
+  const std::string golden = test_data("golden/square56_tiny_seed1.safetensors");
   const auto check = [&](std::vector<std::string> more) {
-    more.insert(more.begin(), {LVGGT_CHECK_REFERENCE, "--tolerance", "0.2", "--weights",
+    more.insert(more.begin(), {program("check_reference"), "--tolerance", "0.2", "--weights",
                                source.dir / "int8", golden});
     return run(more);
   };

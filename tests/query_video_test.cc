@@ -10,6 +10,7 @@
 #include "lvggt/io/json.h"
 #include "tests/support/child_process.h"
 #include "tests/support/files.h"
+#include "tests/support/paths.h"
 #include "tests/support/temp_dir.h"
 #include "tests/support/tiny_field.h"
 
@@ -54,9 +55,14 @@ class Asked {
   std::string operator/(const std::string& name) const { return dir_ / name; }
 
   std::vector<std::string> command(const std::vector<std::string>& more) const {
-    std::vector<std::string> argv{
-        LVGGT_QUERY_VIDEO, dir_ / "field",          "--text-encoder", dir_ / "phrases.npy",
-        "--autoencoder",   dir_ / "ae.safetensors", "--threads",      "2"};
+    std::vector<std::string> argv{lvggt::test::program("query_video"),
+                                  dir_ / "field",
+                                  "--text-encoder",
+                                  dir_ / "phrases.npy",
+                                  "--autoencoder",
+                                  dir_ / "ae.safetensors",
+                                  "--threads",
+                                  "2"};
     argv.insert(argv.end(), more.begin(), more.end());
     return argv;
   }
@@ -210,8 +216,9 @@ TEST_CASE("query_video: files that do not fit each other are named") {
   const Asked asked;
   test::write_identity_autoencoder(asked / "narrow.safetensors", 3);
   const auto ask = [&](const std::string& autoencoder, const std::string& encoder) {
-    test::ChildProcess child({LVGGT_QUERY_VIDEO, asked / "field", "cup", "--text-encoder",
-                              asked / encoder, "--autoencoder", asked / autoencoder});
+    test::ChildProcess child({lvggt::test::program("query_video"), asked / "field", "cup",
+                              "--text-encoder", asked / encoder, "--autoencoder",
+                              asked / autoencoder});
     const int status = child.wait();
     return Result{status, child.out(), child.err()};
   };

@@ -9,6 +9,7 @@
 #include "lvggt/core/simd.h"
 #include "lvggt/io/png.h"
 #include "tests/support/child_process.h"
+#include "tests/support/paths.h"
 #include "tests/support/temp_dir.h"
 
 using namespace lvggt;
@@ -34,20 +35,20 @@ Result run(const std::string& target, std::vector<std::string> argv) {
 TEST_CASE(
     "D48: with any instruction set, also without AVX2, the reference is met and videos lifted") {
   const TempDir dir;
-  const std::string golden = LVGGT_TEST_DATA "/golden/", model = dir / "model.safetensors";
+  const std::string golden = test_data("golden/"), model = dir / "model.safetensors";
   const std::vector<std::string> targets = simd_targets();
-  REQUIRE(run(targets.back(),
-              {LVGGT_WEIGHTS_INIT, "--config", golden + "config_tiny.json", "--seed", "1", model})
+  REQUIRE(run(targets.back(), {program("weights_init"), "--config", golden + "config_tiny.json",
+                               "--seed", "1", model})
               .status == 0);
   Tensor<std::uint8_t, 3> pixels(Shape{std::int64_t{56}, std::int64_t{84}, std::int64_t{3}});
   write_png(dir / "picture.png", pixels);
   for (const std::string& target : targets) {
     CAPTURE(target);
-    const Result check = run(target, {LVGGT_CHECK_REFERENCE, "--weights", model,
+    const Result check = run(target, {program("check_reference"), "--weights", model,
                                       golden + "square56_tiny_seed1.safetensors"});
     CAPTURE(check.err);
     CHECK(check.status == 0);
-    const Result lift = run(target, {LVGGT_LIFT_VIDEO, dir / "picture.png", "--weights", model,
+    const Result lift = run(target, {program("lift_video"), dir / "picture.png", "--weights", model,
                                      "--mode", "original", "--weights-storage", "int8",
                                      "--cache-storage", "int8", "--out", dir / "out", "--force"});
     CAPTURE(lift.err);
@@ -56,7 +57,7 @@ TEST_CASE(
 }
 
 TEST_CASE("LVGGT_SIMD: a name that is none is refused with those that there are") {
-  const Result result = run("AVX9", {LVGGT_WEIGHTS_INFO, "x"});
+  const Result result = run("AVX9", {program("weights_info"), "x"});
   CHECK(result.status == 2);
   CHECK(result.err.find("'AVX9'") != std::string::npos);
   CHECK(result.err.find(simd_targets().back()) != std::string::npos);

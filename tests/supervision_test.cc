@@ -7,6 +7,7 @@
 
 #include "lvggt/data/scene.h"
 #include "tests/support/files.h"
+#include "tests/support/paths.h"
 #include "tests/support/safetensors_bytes.h"
 #include "tests/support/tiny_scene.h"
 
@@ -227,7 +228,7 @@ TEST_CASE("paint_targets: shrinking takes the pixel in the middle, as the pictur
 }
 
 TEST_CASE("supervision: a real labelled frame is read as its makers describe it") {
-  const Scene scene = Scene::open(LVGGT_TEST_DATA "/golden/scene");
+  const Scene scene = Scene::open(lvggt::test::test_data("golden/scene"));
   REQUIRE(scene.frames().size() == 1);
   for (const SupervisionSpec& spec : {kClip, kDynamic}) {
     const auto [rows, codes] = scene.label_files(scene.frames()[0], spec);

@@ -16,6 +16,7 @@
 #include "lvggt/model/checkpoint.h"
 #include "lvggt/model/deterministic_weights.h"
 #include "lvggt/train/training_log.h"
+#include "tests/support/paths.h"
 #include "tests/support/training_scene.h"
 
 namespace {
@@ -77,7 +78,7 @@ TEST_CASE("train_decoder: from a scene to a decoder, with log, pictures and scor
 TEST_CASE("train_decoder: its decoder and its checkpoints load as a model's decoder") {
   const TrainingScene scene;
   REQUIRE(scene.train("out").status == 0);
-  const ModelConfig config = load_config(LVGGT_TEST_DATA "/golden/config_tiny.json");
+  const ModelConfig config = load_config(lvggt::test::test_data("golden/config_tiny.json"));
   SafetensorsWriter geometry(scene / "geometry.safetensors");
   geometry.set_metadata("config", to_json(config));
   for (const TensorSpec& spec : geometry_tensors(config)) {

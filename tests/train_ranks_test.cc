@@ -14,6 +14,7 @@
 #include <vector>
 
 #include "lvggt/train/training_log.h"
+#include "tests/support/paths.h"
 #include "tests/support/training_scene.h"
 
 namespace {
@@ -25,7 +26,7 @@ using test::TrainResult;
 constexpr int kSkipped = 77;  // exit status of run_ranks.sh without mpirun
 
 std::vector<std::string> under_mpirun(int ranks, const std::vector<std::string>& command) {
-  std::vector<std::string> argv{"/bin/bash", LVGGT_TEST_DATA "/mpi/run_ranks.sh",
+  std::vector<std::string> argv{"/bin/bash", lvggt::test::test_data("mpi/run_ranks.sh"),
                                 std::to_string(ranks)};
   argv.insert(argv.end(), command.begin(), command.end());
   return argv;

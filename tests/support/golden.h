@@ -7,12 +7,13 @@
 
 #include "lvggt/io/safetensors.h"
 #include "tests/support/compare.h"
+#include "tests/support/paths.h"
 
 namespace lvggt::test {
 
 // The file of that name in tests/golden.
 inline Safetensors open_golden(const std::string& name) {
-  return Safetensors::open(std::string(LVGGT_TEST_DATA) + "/golden/" + name);
+  return Safetensors::open(test_data("golden/") + name);
 }
 
 // A dense copy with the axes in another order: axis i of the copy is axis order[i] of x. The order

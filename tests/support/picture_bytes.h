@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "lvggt/io/image.h"
+#include "tests/support/paths.h"
 
 namespace lvggt::test {
 
@@ -28,9 +29,7 @@ inline void write_file(const std::string& path, std::string_view bytes) {
   if (!file.flush()) throw std::runtime_error("cannot write " + path);
 }
 
-inline std::string golden(const std::string& name) {
-  return std::string(LVGGT_TEST_DATA) + "/golden/" + name;
-}
+inline std::string golden(const std::string& name) { return test_data("golden/") + name; }
 
 inline Image decode(std::string_view bytes, const Limits& limits = {}) {
   return load_image(std::as_bytes(std::span(bytes.data(), bytes.size())), "picture", limits);

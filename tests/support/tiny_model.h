@@ -9,6 +9,7 @@
 #include "lvggt/model/deterministic_weights.h"
 #include "lvggt/model/stream.h"
 #include "tests/support/golden.h"
+#include "tests/support/paths.h"
 #include "tests/support/temp_dir.h"
 
 namespace lvggt::test {
@@ -23,9 +24,7 @@ struct WeightTensor {
 using ChangeWeight = std::function<void(WeightTensor&)>;
 
 // The configuration of the reference dumps.
-inline ModelConfig tiny_config() {
-  return load_config(std::string(LVGGT_TEST_DATA) + "/golden/config_tiny.json");
-}
+inline ModelConfig tiny_config() { return load_config(test_data("golden/config_tiny.json")); }
 
 // Writes tensors with the values of the deterministic rule, seed 1, as the reference dumps used
 // them.

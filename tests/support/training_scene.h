@@ -13,6 +13,7 @@
 #include "lvggt/model/deterministic_weights.h"
 #include "tests/support/child_process.h"
 #include "tests/support/files.h"
+#include "tests/support/paths.h"
 #include "tests/support/tiny_scene.h"
 
 namespace lvggt::test {
@@ -55,10 +56,18 @@ class TrainingScene : public TinyScene {
   // Trains into the folder `out` inside the scene's, eight frames with four held out.
   std::vector<std::string> command(const std::string& out,
                                    const std::vector<std::string>& more = {}) const {
-    std::vector<std::string> argv{
-        LVGGT_TRAIN_DECODER, path(), "--config", LVGGT_TEST_DATA "/golden/config_tiny.json",
-        "--held-out-frames", "5-8",  "--batch",  "4",
-        "--threads",         "2",    "--output", *this / out};
+    std::vector<std::string> argv{program("train_decoder"),
+                                  path(),
+                                  "--config",
+                                  test_data("golden/config_tiny.json"),
+                                  "--held-out-frames",
+                                  "5-8",
+                                  "--batch",
+                                  "4",
+                                  "--threads",
+                                  "2",
+                                  "--output",
+                                  *this / out};
     for (const auto& [option, value] :
          std::map<std::string, std::string>{{"--steps", "12"},
                                             {"--learning-rate", "1e-3"},
