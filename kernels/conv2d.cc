@@ -7,6 +7,7 @@
 #include "kernels/pack.h"
 #include "kernels/product.h"
 #include "kernels/tap_gather.h"
+#include "kernels/winograd.h"
 
 namespace lvggt {
 
@@ -48,6 +49,7 @@ void run_conv2d(View<float, 4> y, View<const float, 4> x, const ConvGeometry& ge
   LVGGT_CHECK(epilogue.residual.empty() || epilogue.residual.shape() == y.shape(),
               "conv2d: residual is ", epilogue.residual.shape(), " but y is ", y.shape());
 
+  if (winograd_pays(x.shape(), geometry, Cout)) return run_winograd(y, x, w, epilogue, ctx);
   Arena::Scope scope(ctx.arena());
   // Longer windows than a block of the product would have to be copied.
   const std::int64_t kernel = geometry.kernel, window = kernel * Cin;
