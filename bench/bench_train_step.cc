@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// One optimisation step of the published decoder at 294 x 518 pixels, by phase:
-//   bench_train_step [--batch=1] [--threads=0] [--steps=5] [--recompute]
+// One optimisation step of the published decoder at 294 x 518 pixels, by phase.
 #include <algorithm>
 #include <cstdio>
 #include <cstdlib>
@@ -9,12 +8,23 @@
 
 #include "bench/peak.h"
 #include "bench/shapes.h"
+#include "bench/simd_option.h"
 #include "lvggt/cli/memory.h"
 #include "lvggt/train/decoder_trainer.h"
 
 namespace {
 
 using namespace lvggt;
+
+constexpr const char* kHelp =
+    "One optimisation step of the published decoder at 294 x 518 pixels, by phase.\n"
+    "Usage: bench_train_step [--batch=1] [--steps=5] [--threads=0] [--recompute] [--simd=NAME]\n"
+    "  --batch=N      frames a step\n"
+    "  --steps=N      steps to time\n"
+    "  --threads=N    threads; 0: all this process may use\n"
+    "  --recompute    compute activations again in the backward pass, for less memory\n"
+    "  --simd=NAME    limit the kernels to an instruction set: AVX2\n"
+    "bench/peers/torch_decoder_step.py takes the same step in PyTorch.\n";
 
 struct Arguments {
   std::int64_t batch = 1, steps = 5;
@@ -38,7 +48,7 @@ Arguments parse(int argc, char** argv) {
     } else if (std::string_view(argv[i]) == "--recompute") {
       a.recompute = true;
     } else {
-      fail(ErrorKind::kUsage, "unknown argument ", argv[i]);
+      fail(ErrorKind::kUsage, "unknown argument ", argv[i], "; see --help");
     }
   }
   return a;
@@ -108,7 +118,13 @@ void run(const Arguments& a) {
 }  // namespace
 
 int main(int argc, char** argv) {
+  for (int i = 1; i < argc; ++i) {
+    if (std::string_view(argv[i]) != "--help") continue;
+    std::fputs(kHelp, stdout);
+    return 0;
+  }
   try {
+    bench::apply_simd_option(&argc, argv);
     run(parse(argc, argv));
   } catch (const lvggt::Error& e) {
     std::fprintf(stderr, "bench_train_step: %s\n", e.what());
