@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // Runs the case that a reference file names and compares every tensor in it with ours.
 #include <cstdio>
+#include <filesystem>
 #include <string>
 
 #include "examples/check_reference/cases.h"
@@ -82,21 +83,8 @@ void run_case(const std::string& name, check_reference::Comparison& comparison,
   }
 }
 
-// Cases that are JSON have no metadata: their content tells them apart.
-int check_json(const Options& options) {
-  const Json json = Json::read(options.case_file);
-  if (!check_reference::is_tokenizer_case(json))
-    fail(ErrorKind::kUnsupported, options.case_file, ": is none of the JSON cases: tokenizer");
-  if (options.vocabulary.empty())
-    fail(ErrorKind::kUsage, "--vocabulary is required for the case \"tokenizer\"");
-  return check_reference::check_tokenizer(json, options.case_file, options.vocabulary, options.json)
-             ? 0
-             : 1;
-}
-
-int check(const Options& options) {
-  if (options.case_file.ends_with(".json")) return check_json(options);
-  const Safetensors file = Safetensors::open(options.case_file);
+int check_file(const std::string& path, const Options& options) {
+  const Safetensors file = Safetensors::open(path);
   const std::string name = case_of(file);
   Context ctx(options.threads);
   check_reference::Comparison comparison(file, options.tolerance);
@@ -107,6 +95,32 @@ int check(const Options& options) {
       std::fflush(stdout) != 0)
     fail(ErrorKind::kWrite, "standard output: cannot be written");
   return comparison.ok() ? 0 : 1;
+}
+
+// Cases that are JSON have no metadata: their content or name tells them apart. Annotations are
+// inputs: what they give is in the polygons case beside them.
+int check_json(const Options& options) {
+  const Json json = Json::read(options.case_file);
+  if (check_reference::is_tokenizer_case(json)) {
+    if (options.vocabulary.empty())
+      fail(ErrorKind::kUsage, "--vocabulary is required for the case \"tokenizer\"");
+    return check_reference::check_tokenizer(json, options.case_file, options.vocabulary,
+                                            options.json)
+               ? 0
+               : 1;
+  }
+  const auto polygons =
+      std::filesystem::path(options.case_file).parent_path() / "polygons_seed1.safetensors";
+  if (!options.case_file.ends_with("annotations_seed1.json") &&
+      !options.case_file.ends_with("annotations_seed1.coco.json"))
+    fail(ErrorKind::kUnsupported, options.case_file,
+         ": is none of the JSON cases: tokenizer, annotations (beside polygons_seed1.safetensors)");
+  return check_file(polygons.string(), options);
+}
+
+int check(const Options& options) {
+  return options.case_file.ends_with(".json") ? check_json(options)
+                                              : check_file(options.case_file, options);
 }
 
 }  // namespace
@@ -121,7 +135,8 @@ int main(int argc, char** argv) {
       "|ours - ref| / |ref| by Euclidean norms. Those cases have limits of their own.",
       LVGGT_VERSION);
   auto& app = program.app();
-  app.add_option("case", options.case_file, "Reference file (safetensors; JSON for the tokenizer)")
+  app.add_option("case", options.case_file,
+                 "Reference file (safetensors; JSON for the tokenizer and annotations)")
       ->required()
       ->type_name("CASE");
   app.add_option("--inputs", options.inputs,
