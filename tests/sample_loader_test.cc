@@ -183,7 +183,7 @@ TEST_CASE("sample_loader: held-out frames come in order") {
   CHECK_THROWS_AS(SampleLoader(*none.set, options), Error);
 }
 
-TEST_CASE("B23: a sample that cannot be read is replaced, counted and reported; many end the run") {
+TEST_CASE("B23, D22: a sample that cannot be read is replaced, counted and reported; many end the run") {
   const Data data(6);
   SampleLoader whole(*data.set, options_of(3));
   const auto first = samples_of(whole.next());
