@@ -20,6 +20,9 @@ struct Contents {
   bool geometry = false;
   bool decoder = false;
   bool encoder = false;  // DINOv2 alone
+  bool clip_text = false, clip_image = false;
+  bool mistral = false;
+  bool autoencoder = false;
 };
 
 bool any_starts(const std::vector<TensorEntry>& tensors,
@@ -35,9 +38,30 @@ Contents contents_of(const std::vector<TensorEntry>& tensors) {
   contents.geometry =
       any_starts(tensors, {"aggregator.", "camera_head.", "depth_head.", "point_head."});
   contents.decoder = any_starts(tensors, {"feature_extractor.", "lang_encoder.", "lang_decoder"});
+  contents.clip_text = any_starts(tensors, {"token_embedding.weight", "text.token_embedding.weight",
+                                            "text_model.embeddings.token_embedding.weight"});
+  contents.clip_image = any_starts(
+      tensors, {"visual.conv1.weight", "vision_model.embeddings.patch_embedding.weight"});
+  contents.mistral =
+      any_starts(tensors, {"model.layers.0.mlp.gate_proj.weight", "layers.0.mlp.gate_proj.weight"});
+  contents.autoencoder =
+      any_starts(tensors, {"encoder.0.weight"}) && any_starts(tensors, {"decoder.0.weight"});
   contents.encoder = !contents.geometry && any_starts(tensors, {"blocks.0.attn.qkv."}) &&
                      any_starts(tensors, {"patch_embed.proj."});
   return contents;
+}
+
+// What lvggt knows beside its own model.
+std::string other_contents(const Contents& contents) {
+  if (contents.clip_text && contents.clip_image)
+    return "CLIP: encoders of phrases (--text-encoder) and pictures (--image-encoder)";
+  if (contents.clip_text) return "CLIP's encoder of phrases (--text-encoder)";
+  if (contents.clip_image) return "CLIP's encoder of pictures (--image-encoder)";
+  if (contents.mistral)
+    return "a language model of Mistral's kind, such as e5-mistral (--sentence-encoder)";
+  if (contents.autoencoder) return "an autoencoder of language features, as 4DLangSplat's";
+  if (contents.encoder) return "a DINOv2 encoder alone, which lvggt does not run";
+  return "nothing lvggt knows: no aggregator, no heads, no decoder";
 }
 
 void name_contents(const Contents& contents, bool track_head, bool untrained,
@@ -51,8 +75,7 @@ void name_contents(const Contents& contents, bool track_head, bool untrained,
   } else if (contents.decoder) {
     d.contents = kDecoder;
   } else {
-    d.contents = contents.encoder ? "a DINOv2 encoder alone, which lvggt does not run"
-                                  : "nothing lvggt knows: no aggregator, no heads, no decoder";
+    d.contents = other_contents(contents);
   }
   if (track_head) d.contents += ", with a track head that is not used";
   if (untrained) {

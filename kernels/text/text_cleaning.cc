@@ -66,8 +66,10 @@ std::u32string repair_line(std::u32string line, bool references) {
     std::u32string next = references ? text::replace_closed_references(line) : line;
     next = text::repair_encoding(next);
     std::u32string characters;
-    for (const char32_t c : next)
-      for (const char32_t part : repaired(c)) characters.push_back(straightened(part));
+    for (std::size_t i = 0; i < next.size(); ++i) {
+      if (next[i] == '\r' && i + 1 < next.size() && next[i + 1] == '\n') continue;
+      for (const char32_t part : repaired(next[i])) characters.push_back(straightened(part));
+    }
     next = text::normal_form_c(without_controls(characters));
     if (next == line) break;
     line = std::move(next);

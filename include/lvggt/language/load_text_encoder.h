@@ -19,8 +19,8 @@ inline constexpr const char* kSentenceQueryPrompt =
     "Instruct: Given a news summary, retrieve other semantically similar summaries\nQuery: ";
 
 struct TextEncoderOptions {
-  std::string vocabulary;  // of the tokeniser: a folder or file; empty: beside the weights
-  std::string config;      // JSON; empty: beside the weights
+  std::string vocabulary{};  // of the tokeniser: a folder or file; empty: beside the weights
+  std::string config{};      // JSON; empty: beside the weights
   // In front of every sentence; Mistral only.
   std::string prompt = kSentenceQueryPrompt;
 };
