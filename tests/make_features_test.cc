@@ -184,6 +184,27 @@ TEST_CASE("ObjectMasks: label pictures of one level and of four; 16 bits are ref
   CHECK(outcome_of([&] { one->read(scene.frames()[0]); }).kind == ErrorKind::kUnsupported);
 }
 
+TEST_CASE("ObjectMasks: COCO's categories are objects with one number in all frames") {
+  const SceneFiles files;
+  const Scene scene = Scene::open(files.scene);
+  write_file(files.dir / "coco.json", R"({
+      "categories": [{"id": 5, "name": "wall"}, {"id": 2, "name": "cup"}],
+      "images": [{"id": 1, "file_name": "000001_png.jpg", "height": 30, "width": 40},
+                 {"id": 2, "file_name": "000002_png.jpg", "height": 30, "width": 40}],
+      "annotations": [
+        {"image_id": 1, "category_id": 2, "segmentation": [[4, 5, 13, 5, 13, 19, 4, 19]]},
+        {"image_id": 2, "category_id": 5, "segmentation": [[0, 0, 39, 0, 39, 29, 0, 29]]},
+        {"image_id": 2, "category_id": 2, "segmentation": [[4, 5, 13, 5, 13, 19, 4, 19]]}]})");
+  const auto masks = ObjectMasks::open(files.dir / "coco.json", scene);
+  CHECK(masks->describe().find("1 cup; 2 wall") != std::string::npos);
+  const auto first = masks->read(scene.frames()[0]), second = masks->read(scene.frames()[1]);
+  CHECK(first.shape() == (Shape{std::int64_t{1}, kHeight, kWidth}));
+  CHECK(first(0, 10, 10) == 1);
+  CHECK(first(0, 0, 0) == 0);
+  CHECK(second(0, 10, 10) == 1);
+  CHECK(second(0, 0, 0) == 2);
+}
+
 TEST_CASE("read_captions: quotes, columns in any order, and faults by their row") {
   const TempDir dir;
   const auto read = [&](const std::string& text) {

@@ -10,6 +10,7 @@
 #include "lvggt/io/input_file.h"
 #include "lvggt/io/npy.h"
 #include "lvggt/io/safetensors.h"
+#include "lvggt/language/annotations.h"
 
 namespace lvggt {
 namespace {
@@ -111,9 +112,56 @@ class PngMasks : public ObjectMasks {
   bool four_levels_;
 };
 
+class CocoMasks : public ObjectMasks {
+ public:
+  CocoMasks(std::string path, SceneLayout layout)
+      : path_(std::move(path)),
+        first_number_(layout == SceneLayout::kHyperNerf ? 1 : 0),
+        images_(read_coco_annotations(path_, {layout, false})) {
+    for (const AnnotatedImage& image : images_)
+      for (const auto& [label, objects] : image.labels)
+        number_of_.emplace(label, static_cast<std::int32_t>(number_of_.size()) + 1);
+  }
+
+  bool has(const SceneFrame& frame) const override { return find(frame) != nullptr; }
+
+  Tensor<std::int32_t, 3> read(const SceneFrame& frame) const override {
+    const AnnotatedImage* image = find(frame);
+    if (image == nullptr)
+      fail(ErrorKind::kRead, path_, ": annotates no picture of frame ", frame.number);
+    Tensor<std::int32_t, 3> labels(Shape{std::int64_t{1}, image->height, image->width});
+    Tensor<std::uint8_t, 2> mask(Shape{image->height, image->width});
+    for (const auto& [label, objects] : image->labels) {
+      paint_label(mask, objects, PolygonRule::kAll);
+      for (std::int64_t i = 0; i < mask.size(); ++i)
+        if (mask.data()[i] != 0) labels.data()[i] = number_of_.at(label);
+    }
+    return labels;
+  }
+
+  std::string describe() const override {
+    std::string text = "annotations in " + path_ + ":";
+    for (const auto& [label, number] : number_of_) text += concat(" ", number, " ", label, ";");
+    return text.substr(0, text.size() - 1);
+  }
+
+ private:
+  const AnnotatedImage* find(const SceneFrame& frame) const {
+    for (const AnnotatedImage& image : images_)
+      if (image.frame == frame.number - first_number_) return &image;
+    return nullptr;
+  }
+
+  std::string path_;
+  std::int64_t first_number_;
+  std::vector<AnnotatedImage> images_;
+  std::map<std::string, std::int32_t> number_of_;
+};
+
 }  // namespace
 
 std::unique_ptr<ObjectMasks> ObjectMasks::open(const std::string& path, const Scene& scene) {
+  if (path.ends_with(".json")) return std::make_unique<CocoMasks>(path, scene.layout());
   const auto any = [&](const std::string& inside, const char* extension) {
     return std::any_of(scene.frames().begin(), scene.frames().end(), [&](const SceneFrame& frame) {
       return is_there(path + inside + "/" + frame.name + extension);

@@ -22,7 +22,9 @@ class ObjectMasks {
   //   NAME.npy     whole numbers [4, H, W] (default, small, middle, large), [1, H, W] or [H, W]
   //   NAME.png     one level; grey values are the numbers, colours count as 65536 R + 256 G + B
   //   default/NAME.png, small/NAME.png, middle/NAME.png, large/NAME.png
-  // Errors: kRead when nothing is there for any frame.
+  //   FILE.json    COCO polygons or runs; a category is one object, numbered from 1 in the order in
+  //                which the file first annotates them; where two overlap the later one counts
+  // Errors: kRead when nothing is there for any frame; those of read_coco_annotations.
   static std::unique_ptr<ObjectMasks> open(const std::string& path, const Scene& scene);
 
   // Whether there are masks for the frame.
