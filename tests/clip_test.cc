@@ -10,6 +10,7 @@
 
 #include "lvggt/io/json.h"
 #include "tests/support/golden.h"
+#include "tests/support/paths.h"
 #include "tests/support/random.h"
 #include "tests/support/safetensors_bytes.h"
 
@@ -18,7 +19,7 @@ using namespace lvggt::test;
 
 namespace {
 
-const std::string kFolder = std::string(LVGGT_TEST_DATA) + "/golden/language/";
+const std::string kFolder = test_data("golden/language/");
 const std::string kWeights = kFolder + "weights_clip_tiny_seed1.safetensors";
 const ClipConfig kConfig{3, 4, false, "", {}};  // heads of the tiny model's towers
 

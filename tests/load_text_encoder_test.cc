@@ -7,6 +7,7 @@
 
 #include "lvggt/io/npy.h"
 #include "tests/support/golden.h"
+#include "tests/support/paths.h"
 #include "tests/support/safetensors_bytes.h"
 
 using namespace lvggt;
@@ -14,7 +15,7 @@ using namespace lvggt::test;
 
 namespace {
 
-const std::string kFolder = std::string(LVGGT_TEST_DATA) + "/golden/language/";
+const std::string kFolder = test_data("golden/language/");
 
 // A model in the published layout around the tiny weights: 320 tokens of its own.
 void write_mistral(const std::string& folder, std::int64_t vocabulary) {
@@ -52,9 +53,8 @@ TEST_CASE("load_text_encoder: vectors, CLIP and Mistral are told apart by conten
   CHECK(mistral->width() == 64);
   CHECK(mistral->describe().find("Mistral, 3 layers of width 64") == 0);
 
-  const Outcome outcome = outcome_of([&] {
-    load_text_encoder(std::string(LVGGT_TEST_DATA) + "/golden/ops_tiny_seed1.safetensors");
-  });
+  const Outcome outcome =
+      outcome_of([&] { load_text_encoder(test_data("golden/ops_tiny_seed1.safetensors")); });
   CHECK(outcome.kind == ErrorKind::kMismatch);
   CHECK(outcome.says("is no text encoder"));
 }

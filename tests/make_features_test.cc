@@ -12,6 +12,7 @@
 #include "lvggt/language/object_masks.h"
 #include "tests/support/child_process.h"
 #include "tests/support/compare.h"
+#include "tests/support/paths.h"
 #include "tests/support/random.h"
 #include "tests/support/safetensors_bytes.h"
 
@@ -22,8 +23,7 @@ namespace {
 
 namespace fs = std::filesystem;
 
-const std::string kWeights =
-    std::string(LVGGT_TEST_DATA) + "/golden/language/weights_clip_tiny_seed1.safetensors";
+const std::string kWeights = test_data("golden/language/weights_clip_tiny_seed1.safetensors");
 constexpr std::int64_t kHeight = 30, kWidth = 40;
 
 // Two frames with three objects on one level; object 3 is one pixel wide and gets no features.
@@ -64,7 +64,7 @@ struct SceneFiles {
 
   // Runs the program on the scene; its exit status and what it said.
   std::pair<int, std::string> run(std::vector<std::string> arguments) const {
-    arguments.insert(arguments.begin(), {LVGGT_MAKE_FEATURES, scene, "--threads", "1"});
+    arguments.insert(arguments.begin(), {program("make_features"), scene, "--threads", "1"});
     ChildProcess child(arguments);
     const int status = child.wait();
     return {status, child.err()};

@@ -7,6 +7,7 @@
 
 #include "tests/support/files.h"
 #include "tests/support/golden.h"
+#include "tests/support/paths.h"
 #include "tests/support/safetensors_bytes.h"
 
 using namespace lvggt;
@@ -14,7 +15,7 @@ using namespace lvggt::test;
 
 namespace {
 
-const std::string kFolder = std::string(LVGGT_TEST_DATA) + "/golden/language/";
+const std::string kFolder = test_data("golden/language/");
 const std::string kWeights = kFolder + "weights_mistral_tiny_seed1.safetensors";
 const MistralConfig kConfig{16, 1e-5f, 10000, ""};
 

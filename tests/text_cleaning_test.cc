@@ -4,13 +4,14 @@
 #include <doctest/doctest.h>
 
 #include "lvggt/io/json.h"
+#include "tests/support/paths.h"
 #include "tests/support/safetensors_bytes.h"
 
 using namespace lvggt;
 using namespace lvggt::test;
 
 TEST_CASE("clean_text: all 520 strings of the reference become what its tokeniser sees") {
-  const std::string path = std::string(LVGGT_TEST_DATA) + "/golden/language/tokenizer_seed1.json";
+  const std::string path = test_data("golden/language/tokenizer_seed1.json");
   std::int64_t strings = 0;
   const Json json = Json::read(path);
   for (const Json& entry : json.as_array(path)) {
