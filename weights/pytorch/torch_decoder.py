@@ -108,7 +108,7 @@ class FeatureExtractor(nn.Module):
         layers = []
         for i, tokens in enumerate(taps):
             x = self.norm(tokens).transpose(1, 2).reshape(tokens.shape[0], -1, h, w)
-            x = self.placed(self.projects[i](x), size)
+            x = self.placed(self.projects[i](x).float(), size)
             layers.append(getattr(self.scratch, f"layer{i + 1}_rn")(self.resize_layers[i](x)))
         x = layers[3]
         for i in (3, 2, 1, 0):

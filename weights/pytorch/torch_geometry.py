@@ -73,7 +73,7 @@ class Attention(nn.Module):
         """x: [B, N, C]; cache: list of earlier (k, v), to which this call adds its own; mask: [N, N],
         added to the scores."""
         B, N, C = x.shape
-        q, k, v = self.qkv(x).reshape(B, N, 3, self.heads, C // self.heads).permute(2, 0, 3, 1, 4)
+        q, k, v = self.qkv(x).to(x.dtype).reshape(B, N, 3, self.heads, C // self.heads).permute(2, 0, 3, 1, 4)
         q, k = self.q_norm(q), self.k_norm(k)
         if rope is not None:
             q, k = rope(q), rope(k)
@@ -254,7 +254,7 @@ class DptHead(FeatureExtractor):
         return x + position_embedding(x.shape[2], x.shape[3], x.shape[1], size[1] / size[0], self.ratio)
 
     def forward(self, taps, h, w, size):
-        x = self.scratch.output_conv2(self.placed(super().forward(taps, h, w, size), size))
+        x = self.scratch.output_conv2(self.placed(super().forward(taps, h, w, size), size)).float()
         values, confidence = x[:, :-1], 1 + x[:, -1:].exp()
         if values.shape[1] == 1:
             return values.exp(), confidence
@@ -271,19 +271,23 @@ class StreamVggt(nn.Module):
             self.point_head = DptHead(c, 4)
         self.c = c
 
-    def clips(self, images):
+    def clips(self, images, bf16=False):
         """images: [B, S, 3, H, W] -> poses [B, S, iterations, 9] with the camera head's cache as in a
-        stream, depth and confidence [B, S, H, W], taps [B * S, h * w, 2C]."""
+        stream, depth and confidence [B, S, H, W], taps [B * S, h * w, 2C]. bf16: products of the
+        aggregator and the depth head in bfloat16, for training on a CPU that has them."""
         c, (B, S, _, H, W) = self.c, images.shape
         h, w, special = H // c["patch_size"], W // c["patch_size"], 1 + c["num_register_tokens"]
         head_dim = c["embed_dim"] // c["agg_heads"]
         rope = Rope2d(h, w, head_dim, c["rope_freq"], special)
         frames_rope = Rope2d(h, w, head_dim, c["rope_freq"], special, S)
-        outputs = self.aggregator.clips(images, rope, frames_rope, frame_mask(S, special + h * w))
+        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            outputs = self.aggregator.clips(images, rope, frames_rope, frame_mask(S, special + h * w))
+        outputs = [x.float() for x in outputs]
         caches = [[] for _ in self.camera_head.trunk]
         poses = [torch.cat(self.camera_head(outputs[-1][:, s, :1], caches), 1) for s in range(S)]
         taps = [outputs[i][:, :, special:].flatten(0, 1) for i in c["taps"]]
-        depth, confidence = self.depth_head(taps, h, w, (H, W))
+        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            depth, confidence = self.depth_head(taps, h, w, (H, W))
         return {"pose": torch.stack(poses, 1), "depth": depth.view(B, S, H, W),
                 "confidence": confidence.view(B, S, H, W), "taps": taps}
 

@@ -149,9 +149,12 @@ class Maker {
     path.shake = random_.direction() * (shake * distance);
     path.shake_turn = random_.direction() * (shake * random_.uniform(0.3f, 1.5f));
     if (kind < 0.45f) return;  // held, but meant to stay
-    path.velocity = random_.direction() * (distance * random_.log_uniform(0.05f, 0.6f));
+    // So much between two frames, however far apart they are.
+    const float frames_per_second = 1 / scene_.seconds_per_frame;
+    path.velocity =
+        random_.direction() * (distance * random_.log_uniform(0.01f, 0.16f) * frames_per_second);
     path.velocity.y *= 0.5f;
-    path.turn = random_.direction() * random_.log_uniform(0.03f, 0.5f);
+    path.turn = random_.direction() * (random_.log_uniform(0.006f, 0.12f) * frames_per_second);
     path.keep_target = random_.chance(0.5f) ? random_.uniform(0.3f, 1) : 0;
   }
 

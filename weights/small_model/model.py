@@ -153,6 +153,8 @@ def read_safetensors(path):
     metadata, tensors = header.pop("__metadata__", {}), {}
     kinds = {"F32": torch.float32, "BF16": torch.bfloat16}
     for name, entry in header.items():
+        if entry["dtype"] not in kinds:
+            continue  # numbers that are no weights
         begin, end = entry["data_offsets"]
         raw = torch.frombuffer(bytearray(data[8 + size + begin:8 + size + end]), dtype=kinds[entry["dtype"]])
         tensors[name] = raw.float().view(entry["shape"])

@@ -22,6 +22,13 @@ struct Placed {
   float radius = 0;
 };
 
+// A sphere around the neighbours placed_[first..last] of one group, so that rays may pass them all.
+struct Bunch {
+  int first = 0, last = 0;
+  Vec3 center;
+  float radius = 0;
+};
+
 // What a sample's ray met.
 struct Hit {
   float z = kMiss;
@@ -39,6 +46,7 @@ class Frame {
         focal_(0.5f * static_cast<float>(width_) / std::tan(0.5f * scene.fov_w)),
         hits_(static_cast<std::size_t>(height_) * static_cast<std::size_t>(width_)) {
     for (const Primitive& primitive : scene.primitives) place(primitive, time);
+    bunch();
     for (std::size_t i = 0; i < placed_.size(); ++i) trace(static_cast<int>(i));
   }
 
@@ -79,6 +87,22 @@ class Frame {
     placed_.push_back(p);
   }
 
+  void bunch() {
+    for (int i = 0, n = static_cast<int>(placed_.size()); i < n;) {
+      Bunch b;
+      b.first = i;
+      const int group = placed(i).primitive->group;
+      for (; i < n && placed(i).primitive->group == group; ++i)
+        b.center = b.center + placed(i).center;
+      b.last = i - 1;
+      b.center = b.center * (1 / static_cast<float>(i - b.first));
+      for (int k = b.first; k <= b.last; ++k)
+        b.radius = std::max(b.radius, length(placed(k).center - b.center) + placed(k).radius);
+      bunches_.push_back(b);
+    }
+  }
+  const Placed& placed(int i) const { return placed_[static_cast<std::size_t>(i)]; }
+
   // First and last sample that the sphere can cover, along one axis.
   void cover(float c, float z, float radius, int size, int& first, int& last) const {
     first = 0;
@@ -92,8 +116,8 @@ class Frame {
     last = static_cast<int>(std::clamp(std::ceil(middle + b * focal_), -1.0f, end - 1));
   }
 
-  void trace(int solid) {
-    const Placed& p = placed_[static_cast<std::size_t>(solid)];
+  void trace(int number) {
+    const Placed& p = placed(number);
     if (p.center.z + p.radius <= kNear) return;
     int top = 0, bottom = 0, left = 0, right = 0;
     cover(p.center.y, p.center.z, p.radius, height_, top, bottom);
@@ -103,7 +127,7 @@ class Frame {
         const float z = hit(p.primitive->shape, p.primitive->taper, p.origin,
                             p.local_from_cam * ray(y, x), kNear);
         Hit& best = at(y, x);
-        if (z < best.z) best = {z, solid};
+        if (z < best.z) best = {z, number};
       }
     }
   }
@@ -126,16 +150,21 @@ class Frame {
 
   bool in_shadow(Vec3 p, Vec3 to_light, int self) const {
     const float squared = dot(to_light, to_light);
-    for (std::size_t i = 0; i < placed_.size(); ++i) {
-      const Placed& s = placed_[i];
-      if (static_cast<int>(i) == self && s.primitive->shape != Shape::kBox) continue;
-      const Vec3 c = s.center - p;
-      const float along = std::clamp(dot(c, to_light) / squared, 0.0f, 1.0f);
-      const Vec3 off = c - to_light * along;
-      if (dot(off, off) > s.radius * s.radius) continue;
-      const Vec3 o = s.origin + s.local_from_cam * p;
-      if (hit(s.primitive->shape, s.primitive->taper, o, s.local_from_cam * to_light, 2e-3f) < 1)
-        return true;
+    const auto passes = [&](Vec3 center, float radius) {
+      const Vec3 c = center - p;
+      const Vec3 off = c - to_light * std::clamp(dot(c, to_light) / squared, 0.0f, 1.0f);
+      return dot(off, off) > radius * radius;
+    };
+    for (const Bunch& b : bunches_) {
+      if (passes(b.center, b.radius)) continue;
+      for (int i = b.first; i <= b.last; ++i) {
+        const Placed& s = placed(i);
+        if ((i == self && s.primitive->shape != Shape::kBox) || passes(s.center, s.radius))
+          continue;
+        const Vec3 o = s.origin + s.local_from_cam * p;
+        if (hit(s.primitive->shape, s.primitive->taper, o, s.local_from_cam * to_light, 2e-3f) < 1)
+          return true;
+      }
     }
     return false;
   }
@@ -148,7 +177,8 @@ class Frame {
     const Vec3 eye = normalized(p * -1.0f);
     Vec3 sum = scene_.ambient * (0.8f - 0.2f * dot(n, down)) * color;
     for (const Light& light : scene_.lights) {
-      const Vec3 at = cam_from_world_(light.position) + random.direction() * light.radius;
+      const Vec3 off{random.uniform(-1, 1), random.uniform(-1, 1), random.uniform(-1, 1)};
+      const Vec3 at = cam_from_world_(light.position) + off * light.radius;
       const Vec3 to = at - p;
       const float squared = dot(to, to);
       const Vec3 l = to * (1 / std::sqrt(squared));
@@ -231,6 +261,7 @@ class Frame {
   float focal_;
   std::vector<Hit> hits_;
   std::vector<Placed> placed_;
+  std::vector<Bunch> bunches_;
 };
 
 }  // namespace

@@ -82,6 +82,7 @@ class Run:
                                             {"params": groups[False], "weight_decay": 0.0}],
                                            lr=0, betas=(0.9, 0.98), foreach=True)
         self.stage, self.step, self.total, self.spent, self.stop = 0, 0, 0, 0.0, False
+        self.bf16 = args.bf16
         self.save_every, self.score_every = 60 * args.save_minutes, args.score_every
         if args.resume:
             self.load()
@@ -118,7 +119,7 @@ class Run:
         batch = {k: torch.from_numpy(v) for k, v in scenes.targets(clips).items() if v.dtype == "float32"}
         for group in self.optimiser.param_groups:
             group["lr"] = rate
-        out = self.model.clips(batch["images"])
+        out = self.model.clips(batch["images"], self.bf16)
         loss, terms = small.objective(out, batch)
         terms["helper"] = self.helper.loss(out["taps"][-1], batch)
         self.optimiser.zero_grad(set_to_none=True)
@@ -186,6 +187,7 @@ def main():
     arguments.add_argument("--config", default=str(small.HERE / "config.json"))
     arguments.add_argument("--seed", type=int, default=1)
     arguments.add_argument("--threads", type=int, default=2)
+    arguments.add_argument("--bf16", action="store_true", help="products in bfloat16: faster on a CPU with AVX512_BF16")
     arguments.add_argument("--resume", action="store_true")
     arguments.add_argument("--start-from", help="another run's checkpoint: only its averaged weights")
     arguments.add_argument("--save-minutes", type=float, default=3)
