@@ -288,6 +288,7 @@ void Checkpoint::check_extra(const std::vector<TensorSpec>& expected, bool stric
   std::set<std::string_view> names;
   for (const TensorSpec& spec : expected) names.insert(spec.name);
   std::vector<std::string> extra;
+  std::size_t other_decoder = 0;
   const auto scan = [&](const Safetensors& file, bool takes_decoder_names) {
     for (const TensorEntry& entry : file.entries()) {
       const bool used =
@@ -296,11 +297,17 @@ void Checkpoint::check_extra(const std::vector<TensorSpec>& expected, bool stric
           (skip_points_ && point_head_name(entry.name)))
         continue;
       if (!decoder_ && names.contains(entry.name)) continue;
-      extra.push_back(entry.name);
+      if (decoder_ && !takes_decoder_names && !strict && is_decoder_tensor(entry.name))
+        ++other_decoder;
+      else
+        extra.push_back(entry.name);
     }
   };
   scan(geometry_, false);
   if (decoder_) scan(*decoder_, true);
+  if (other_decoder > 0)
+    warnings_.push_back(concat(geometry_.path(), ": its own decoder (", other_decoder,
+                               " tensors) is not used, because another one is given"));
   if (extra.empty()) return;
   if (strict) {
     problems.extra = std::move(extra);
