@@ -59,10 +59,13 @@ std::size_t Session::planned_bytes(std::int64_t n) const {
                                   : 0;
   };
   const auto pixels = static_cast<std::size_t>(field_.height() * field_.width());
-  // The picture, its painted copies, depth, confidence and the point cloud.
-  constexpr std::size_t kPerPixel = 96;
+  // The picture, its painted copies, depth, confidence and the point cloud; of the overview eight
+  // frames, each with a picture and a mask for up to eight questions; code and scratch to come.
+  const std::size_t per_pixel =
+      96 + 8 * (3 + 4 * static_cast<std::size_t>(std::min<std::int64_t>(n, 8)));
+  constexpr std::size_t kProgram = std::size_t{12} << 20;
   return sizeof(float) * (values(CodesKind::kLanguage) + values(CodesKind::kState)) +
-         FieldQuery::map_bytes(n, field_.height(), field_.width()) + kPerPixel * pixels;
+         FieldQuery::map_bytes(n, field_.height(), field_.width()) + per_pixel * pixels + kProgram;
 }
 
 void Session::keep_codes(std::size_t limit) {

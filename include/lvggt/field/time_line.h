@@ -40,19 +40,20 @@ inline std::vector<std::array<double, 2>> positive_bands(
   return bands;
 }
 
-// One panel for each: the values pale, their smoothed line, the threshold, the intervals shaded.
+// One panel for each: the values grey where they are smoothed, their smoothed line, the threshold,
+// the intervals shaded.
 //   -> [H, W, 3]
 inline Tensor<std::uint8_t, 3> draw_time_lines(const std::vector<TimeLine>& lines) {
   constexpr std::int64_t kWidth = 960, kPanelHeight = 220;
-  constexpr Rgb8 kValueColor{40, 90, 170}, kThresholdColor{200, 60, 40};
+  constexpr Rgb8 kValueColor{40, 90, 170}, kRawColor{150, 150, 150}, kThresholdColor{200, 60, 40};
   std::vector<PlotPanel> panels;
   for (const TimeLine& line : lines) {
     LVGGT_CHECK(line.values.size() == line.seconds.size() && !line.values.empty() &&
                     (line.smoothed.empty() || line.smoothed.size() == line.values.size()),
                 "time line: there are ", line.seconds.size(), " times, ", line.values.size(),
                 " values and ", line.smoothed.size(), " smoothed ones");
-    const auto curve = [&](const std::string& name, const std::vector<float>& values, bool faint) {
-      Curve made{name, kValueColor, {}, faint};
+    const auto curve = [&](const std::string& name, const std::vector<float>& values, bool raw) {
+      Curve made{name, raw ? kRawColor : kValueColor, {}, false};
       for (std::size_t i = 0; i < values.size(); ++i)
         made.points.push_back({line.seconds[i], values[i]});
       return made;
