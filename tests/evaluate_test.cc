@@ -341,7 +341,7 @@ TEST_CASE("evaluate: what does not fit is said in one sentence") {
 
   fs::remove(scene.renders(1) + "/00003.npy");
   fs::remove(scene.renders(1) + "/00002.npy");
-  fails(scene.arguments(), 3, "neither numbered by the annotated frames nor as many");
+  fails(scene.arguments(), 3, "neither numbered by the annotated frames nor one after the other");
   fs::remove(scene.path() + "/annotations/train/000002_png.png");
   fails(scene.arguments(), 3, "000002_png.png: there is no such picture");
 }

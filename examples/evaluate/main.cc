@@ -2,6 +2,7 @@
 // Scores language fields by the published protocol and puts them beside the paper's figures.
 #include <cstdio>
 #include <filesystem>
+#include <optional>
 
 #include "examples/evaluate/pictures.h"
 #include "examples/evaluate/protocol.h"
@@ -49,9 +50,10 @@ std::vector<RunSpec> runs_of(Options& options) {
 SceneResult score_scene(const Options& options, const RunSpec& run, const std::string& scene,
                         const std::string& stem, Encoders& encoders,
                         const cli::InterruptGuard& interrupt, Context& ctx) {
-  cli::Progress progress(-1);
-  const auto step = [&](std::int64_t done, std::int64_t) {
-    progress.show(done);
+  std::optional<cli::Progress> progress;
+  const auto step = [&](std::int64_t done, std::int64_t total) {
+    if (!progress) progress.emplace(total);
+    progress->show(done);
     if (interrupt.requested()) fail(ErrorKind::kInterrupted, "interrupted; nothing was written");
   };
   if (options.out.empty()) return evaluate_scene(run, scene, encoders, step, {}, ctx);

@@ -48,15 +48,17 @@ class RenderFolder {
 
  private:
   // Files are numbered by the index of their frame, or, when only the annotated frames were
-  // rendered, one after the other.
+  // rendered, one after the other from 0 or 1.
   void assign(const std::map<std::int64_t, std::string>& by_number,
               const std::vector<std::int64_t>& annotated) {
     const bool by_index = std::ranges::all_of(
         annotated, [&](std::int64_t frame) { return by_number.contains(frame); });
-    LVGGT_CHECK(by_index || by_number.size() == annotated.size(), folder_, ": holds ",
-                by_number.size(),
-                " maps, which are neither numbered by the annotated frames nor as "
-                "many as these, ",
+    const std::int64_t first_number = by_number.begin()->first;
+    const bool in_a_row = first_number <= 1 && by_number.size() == annotated.size() &&
+                          by_number.rbegin()->first - first_number + 1 == std::ssize(annotated);
+    LVGGT_CHECK(by_index || in_a_row, folder_, ": holds ", by_number.size(),
+                " maps, which are neither numbered by the annotated frames nor one after the other "
+                "as many as these, ",
                 annotated.size());
     auto next = by_number.begin();
     for (const std::int64_t frame : annotated)
