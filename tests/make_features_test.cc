@@ -148,6 +148,8 @@ TEST_CASE("make_features: what does not fit is refused in one sentence") {
   fails({"--captions", files.captions, "--masks", files.masks}, 2, "need each other");
   fails({"--masks", files.scene, "--image-encoder", files.dir / "clip.safetensors"}, 3,
         "holds no masks for the frames");
+  fails({"--autoencoder", test_data("golden/language/autoencoder_tiny_seed1.safetensors")}, 3, "");
+  CHECK(!fs::exists(files.scene + "/clip_features-language_features_dim3"));
   write_npy(files.masks + "/000002.npy", Tensor<std::int32_t, 2>(Shape{40, 30}));
   fails({"--masks", files.masks, "--image-encoder", files.dir / "clip.safetensors"}, 3,
         "is 30 x 40, but its masks");

@@ -110,6 +110,7 @@ void check_image(Comparison& comparison, const std::string& prefix) {
 Tensor<std::uint8_t, 3> noise(std::int64_t N) {
   Tensor<std::uint8_t, 3> picture(Shape{N, N, std::int64_t{3}});
   const std::int64_t blocks = (N + 3) / 4;
+  const std::string block = concat("crop.block.", N), pixel = concat("crop.pixel.", N);
   const auto byte = [](const std::string& name, std::int64_t i) {
     return deterministic_bits(name, 0, static_cast<std::uint64_t>(i)) >> 56;
   };
@@ -117,8 +118,7 @@ Tensor<std::uint8_t, 3> noise(std::int64_t N) {
     for (std::int64_t x = 0; x < N; ++x)
       for (std::int64_t c = 0; c < 3; ++c)
         picture(y, x, c) = static_cast<std::uint8_t>(
-            (7 * byte(concat("crop.block.", N), (y / 4 * blocks + x / 4) * 3 + c) +
-             byte(concat("crop.pixel.", N), (y * N + x) * 3 + c)) /
+            (7 * byte(block, (y / 4 * blocks + x / 4) * 3 + c) + byte(pixel, (y * N + x) * 3 + c)) /
             8);
   return picture;
 }

@@ -191,6 +191,18 @@ Pass compact_pass(const std::string& from, const std::string& folder, const std:
   return pass;
 }
 
+// Before anything is written: every frame has features, of the width that the autoencoder takes.
+void check_raw(const std::string& from, const std::vector<SceneFrame>& frames,
+               const std::string& path, const Autoencoder& autoencoder) {
+  for (const SceneFrame& frame : frames) {
+    const NpyFile rows(from + "/" + frame.name + "_s.npy");
+    const NpyFile features(from + "/" + frame.name + "_f.npy");
+    LVGGT_CHECK(features.shape().size() == 2 && features.shape()[1] == autoencoder.feature_width(),
+                features.path(), ": has the shape ", shape_text(features.shape()), ", but ", path,
+                " takes features of ", autoencoder.feature_width(), " numbers");
+  }
+}
+
 class Run {
  public:
   Run(const MakeFeaturesOptions& options, std::vector<std::string> arguments)
@@ -242,6 +254,7 @@ class Run {
     if (path.empty()) return 0;
     const Autoencoder autoencoder = Autoencoder::load(path);
     const SupervisionSpec spec{kind, autoencoder.code_width()};
+    if (!options_.dry_run) check_raw(base_ + "/" + raw, frames_, path, autoencoder);
     return work(
         compact_pass(base_ + "/" + raw, base_ + "/" + spec.folder(), path, autoencoder, ctx_));
   }
