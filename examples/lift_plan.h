@@ -12,8 +12,10 @@
 
 #include "examples/lift_options.h"
 #include "lvggt/cli/memory_check.h"
+#include "lvggt/cli/output_folder.h"
 #include "lvggt/cli/progress.h"
 #include "lvggt/cli/threads.h"
+#include "lvggt/data/token_cache.h"
 #include "lvggt/io/video.h"
 #include "lvggt/lvggt.h"
 #include "lvggt/model/checkpoint.h"
@@ -78,6 +80,32 @@ inline DecoderSizes decoder_sizes(const ModelFiles& files, const StreamOptions& 
     sizes.state_dim = files.state()->config().lang_dim;
   }
   return sizes;
+}
+
+// What the files of the run hold. Hashes the decoders whose codes are written.
+inline RunFormat run_format(const LiftOptions& options, const Input& input, const ModelFiles& files,
+                            Context& ctx) {
+  RunFormat format;
+  format.transform = input.transform;
+  const DecoderSizes decoders = decoder_sizes(files, options.stream);
+  format.levels = decoders.levels;
+  format.lang_dim = decoders.dim;
+  format.state_levels = decoders.state_levels;
+  format.state_dim = decoders.state_dim;
+  format.has_rgb = (decoders.levels > 0 && files.checkpoint().config().sbd_rgb) ||
+                   (decoders.state_levels > 0 && files.state()->config().sbd_rgb);
+  if (options.outputs.codes && decoders.levels > 0)
+    format.decoder_sha256 = decoder_sha256(files.checkpoint(), ctx);
+  if (options.outputs.codes && decoders.state_levels > 0)
+    format.state_sha256 = decoder_sha256(*files.state(), ctx);
+  format.names_are_files = input.next->name != concat("frame ", input.next->source_index);
+  format.expected_frames = input.source->expected_frames();
+  const std::filesystem::path path(cli::without_trailing_slashes(options.video));
+  format.title = concat(path.filename().string(), "   ", input.transform.width, " x ",
+                        input.transform.height, " pixels");
+  format.footer =
+      "depth and confidence: blue low, red high; semantics: one basis for the whole video";
+  return format;
 }
 
 // Memory beside the model's: what this process holds by now (its libraries, the decoder of the

@@ -6,6 +6,7 @@
 #include <string>
 #include <vector>
 
+#include "lvggt/field/lifted_field.h"
 #include "lvggt/io/image.h"
 #include "lvggt/io/json.h"
 #include "tests/support/child_process.h"
@@ -13,6 +14,7 @@
 #include "tests/support/paths.h"
 #include "tests/support/temp_dir.h"
 #include "tests/support/tiny_field.h"
+#include "tests/support/tiny_model.h"
 
 using namespace lvggt;
 using test::TinyField;
@@ -277,6 +279,47 @@ TEST_CASE("D02: query_video replaces its own answers only, and only when told to
   CHECK(onto.status == 2);
   CHECK(onto.says("another program"));
   CHECK(fs::exists(asked / "field/field.json"));
+}
+
+TEST_CASE("query_video: asks a folder of pictures directly, which it lifts first") {
+  const Asked asked;
+  const ModelConfig config = test::tiny_config();
+  test::write_tensors(asked / "model.safetensors", test::all_tensors(config), &config);
+  test::write_identity_autoencoder(asked / "three.safetensors", 3);
+  test::write_axes(asked / "axes", 3,
+                   {{"cup", 0}, {"object", 1}, {"things", 1}, {"stuff", 2}, {"texture", 2}});
+  fs::create_directory(asked / "pictures");
+  for (const char* name : {"a.png", "b.png"})
+    write_png(asked / ("pictures/" + std::string(name)),
+              Tensor<std::uint8_t, 3>(Shape{std::int64_t{56}, std::int64_t{84}, std::int64_t{3}}));
+  const auto ask = [&](const std::vector<std::string>& more) {
+    std::vector<std::string> argv{test::program("query_video"),
+                                  asked / "pictures",
+                                  "cup",
+                                  "--text-encoder",
+                                  asked / "axes.npy",
+                                  "--autoencoder",
+                                  asked / "three.safetensors",
+                                  "--weights",
+                                  asked / "model.safetensors",
+                                  "--size",
+                                  "84",
+                                  "--threads",
+                                  "2"};
+    argv.insert(argv.end(), more.begin(), more.end());
+    test::ChildProcess child(argv);
+    const int status = child.wait();
+    return Result{status, child.out(), child.err()};
+  };
+  CHECK(ask({}).says("--weights needs --out"));
+  const Result result = ask({"--out", asked / "out"});
+  INFO(result.err);
+  REQUIRE(result.status == 0);
+  CHECK(result.says("lifting "));
+  CHECK(result.says("1 answer about 2 frames"));
+  CHECK(fs::exists(asked / "out/001_cup/points/000001.ply"));
+  CHECK(LiftedField::open(asked / "out/field").num_frames() == 2);
+  CHECK(ask({"--out", asked / "out", "--force"}).status == 0);
 }
 
 TEST_CASE("query_video: --dry-run says what the field holds and writes nothing") {

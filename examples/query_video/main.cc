@@ -5,12 +5,14 @@
 #include <string>
 
 #include "examples/query_video/interactive.h"
+#include "examples/query_video/lift_first.h"
 #include "examples/query_video/options.h"
 #include "examples/query_video/session.h"
 #include "lvggt/cli/interrupt.h"
 #include "lvggt/cli/output_folder.h"
 #include "lvggt/cli/progress.h"
 #include "lvggt/cli/run_record.h"
+#include "lvggt/field/run_writer.h"
 #include "lvggt/io/atomic_file.h"
 #include "lvggt/model/stage_times.h"
 
@@ -52,6 +54,8 @@ void remove_earlier_answers(const std::string& out) {
     cli::remove_earlier_run(out + "/" + folder, {}, {"mask", "heat", "points"});
     cli::remove_earlier_run(out, {folder}, {});
   }
+  cli::remove_earlier_run(out + "/" + kLiftedFolder, run_files(), run_folders());
+  files.push_back(kLiftedFolder);
   cli::remove_earlier_run(out, files, {});
   cli::remove_unfinished_files(out);
 }
@@ -140,7 +144,6 @@ int answer_all(const Options& o, Session& session, const cli::ThreadChoice& thre
     record.status = status;
     if (!o.out.empty()) write_file(o.out + "/" + cli::kRunFile, run_json(record));
   };
-  if (!o.out.empty()) open_folder(o);
   save_record("running");
   cli::Progress progress(record.expected_frames);
   const Hooks hooks{[&] { return interrupt.requested(); },
@@ -182,14 +185,19 @@ int run(Options& o, int argc, char** argv) {
   if (!o.out.empty() && !o.dry_run) check_folder(o);
   const cli::ThreadChoice threads = cli::choose_threads(o.threads);
   Context ctx(threads.threads);
+  if (!o.weights.empty()) {
+    open_folder(o);
+    lift_first(o, o.out + "/" + kLiftedFolder, ctx);
+    o.field = o.out + "/" + kLiftedFolder;
+  }
   Session session(o, ctx);
   if (o.dry_run) {
     print_plan(o, session);
     return 0;
   }
+  if (!o.out.empty() && o.weights.empty()) open_folder(o);
   if (!o.interactive) return answer_all(o, session, threads, ctx, argc, argv);
   if (!o.out.empty()) {
-    open_folder(o);
     cli::RunRecord record = make_record(o, session, threads.threads, argc, argv);
     record.status = "interactive";
     write_file(o.out + "/" + cli::kRunFile, run_json(record));

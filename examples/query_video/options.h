@@ -10,12 +10,17 @@
 #include "lvggt/field/field_query.h"
 #include "lvggt/field/heat_map.h"
 #include "lvggt/io/input_file.h"
+#include "lvggt/io/preprocess.h"
 
 namespace query_video {
 
 // The options of the program.
 struct Options {
   std::string field, out, phrase_file;
+  // The video is lifted first, when there are weights.
+  std::string weights, decoder, state_decoder, config;
+  int size = 0;
+  std::int64_t max_past_frames = 128;
   std::string text_encoder, sentence_encoder, autoencoder, state_autoencoder, vocabulary;
   lvggt::Questions questions;
   lvggt::PhraseQueryOptions protocol;
@@ -44,6 +49,11 @@ struct Options {
       fail(ErrorKind::kUsage, "--state needs --sentence-encoder and --state-autoencoder");
     if (sentence_encoder.empty() != state_autoencoder.empty())
       fail(ErrorKind::kUsage, "--sentence-encoder and --state-autoencoder go together");
+    if (weights.empty() && !(decoder.empty() && state_decoder.empty() && config.empty()))
+      fail(ErrorKind::kUsage, "--decoder, --state-decoder and --config need --weights");
+    if (!weights.empty() && (out.empty() || dry_run))
+      fail(ErrorKind::kUsage,
+           "--weights needs --out, where the lifted field goes, and no --dry-run");
     if (out.empty() && force) fail(ErrorKind::kUsage, "--force is for --out");
   }
 
@@ -61,9 +71,32 @@ struct Options {
   }
 };
 
+inline void add_lifting(lvggt::cli::Program& program, Options& o) {
+  CLI::App& app = program.app();
+  const std::string group = "Lifting first (lift_video has more choices)";
+  const auto add_file = [&](const std::string& name, std::string& file, const std::string& text) {
+    app.add_option(name, file, text)->type_name("FILE")->group(group);
+  };
+  add_file("--weights", o.weights, "Lift FIELD with this geometry model into OUT/field, then ask");
+  add_file("--decoder", o.decoder, "The semantic bridging decoder, unless it is in the same file");
+  add_file("--state-decoder", o.state_decoder, "The decoder of states");
+  add_file("--config", o.config, "The model's configuration, unless the weights tell");
+  program
+      .add_number<int>("--size", o.size, "Width of the model frames, a multiple of 14",
+                       lvggt::kPatchSize, lvggt::kMaxFrameSize)
+      ->default_str("the model's")
+      ->group(group);
+  program
+      .add_number<std::int64_t>("--max-past-frames", o.max_past_frames,
+                                "Past frames the model sees", 1, std::int64_t{1} << 20)
+      ->group(group);
+}
+
 inline void add_options(lvggt::cli::Program& program, Options& o) {
   CLI::App& app = program.app();
-  app.add_option("FIELD", o.field, "The folder that lift_video wrote")->required();
+  app.add_option("FIELD", o.field,
+                 "The folder that lift_video wrote; with --weights, a video or a folder of images")
+      ->required();
   app.add_option("PHRASE", o.questions.phrases,
                  "What to look for, \"the cup\"; any number of them");
   app.add_option("--state", o.questions.states,
@@ -118,6 +151,7 @@ inline void add_options(lvggt::cli::Program& program, Options& o) {
                             "Of the frame's scaled relevancy, above which a pixel is in the mask",
                             0, 1, "R");
   lvggt::cli::add_threads_option(program, o.threads);
+  add_lifting(program, o);
   app.footer(
       "Exit status: 0 done, 1 failed at run time, 2 wrong usage, 3 bad input, 4 memory or a "
       "limit,\n"
