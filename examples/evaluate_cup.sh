@@ -28,13 +28,13 @@ fi
 "$programs/examples/make_tokens" "$name" --weights model.safetensors --out tokens --resume
 "$programs/examples/train_autoencoder" "$name" --held-out-frames "$annotated" --output autoencoder --encode --resume
 "$programs/examples/train_autoencoder" "$name" --supervision dynamic --held-out-frames "$annotated" \
-  --output state_autoencoder --encode --resume
+  --learning-rate 7e-4 --epochs 40 --output state_autoencoder --encode --resume
 "$programs/examples/train_decoder" "$name" --tokens tokens --config "$config" --held-out-frames "$annotated" --batch 4 \
-  --steps 240 --learning-rate 3e-3 --schedule cosine --warmup-steps 10 --evaluate-every 60 --loss-cos 0.1 \
+  --steps 300 --learning-rate 3e-3 --schedule cosine --warmup-steps 10 --evaluate-every 60 --loss-cos 0.1 \
   --output decoder --resume
 "$programs/examples/train_decoder" "$name" --supervision dynamic --tokens tokens --config "$config" \
-  --held-out-frames "$annotated" --batch 4 --steps 400 --learning-rate 2e-3 --schedule cosine --warmup-steps 10 \
-  --evaluate-every 100 --loss-cos 0.2 --output state_decoder --resume
+  --held-out-frames "$annotated" --batch 4 --steps 300 --no-rgb --learning-rate 2e-3 --schedule cosine --warmup-steps 10 \
+  --evaluate-every 60 --loss-cos 0.2 --output state_decoder --resume
 "$programs/examples/evaluate" "$name" --tokens tokens --method "4DLangVGGT on an untrained encoder" \
   --decoder decoder/decoder.safetensors --state-decoder state_decoder/decoder.safetensors \
   --autoencoder autoencoder/autoencoder.safetensors --state-autoencoder state_autoencoder/autoencoder.safetensors \

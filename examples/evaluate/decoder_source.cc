@@ -190,7 +190,9 @@ class DecoderSource : public CodesSource {
       tokens_ = std::make_unique<StreamedTokens>(run, scene, ctx);
     language_.emplace(path(run.decoder), run, *tokens_);
     if (run.state_decoder.empty()) return;
-    states_.emplace(path(run.state_decoder), run, *tokens_);
+    if (!run.state_tokens.empty())
+      state_tokens_ = std::make_unique<CachedTokens>(path(run.state_tokens));
+    states_.emplace(path(run.state_decoder), run, state_tokens_ ? *state_tokens_ : *tokens_);
     LVGGT_CHECK(states_->levels() == 1, path(run.state_decoder), ": has ", states_->levels(),
                 " levels, but dynamic semantics have one");
   }
@@ -205,13 +207,16 @@ class DecoderSource : public CodesSource {
     if (!states_) return;
     const Shape map{H, W, states_->dim()};
     if (codes.states.shape() != map) codes.states = Tensor<float, 3>(map);
-    states_->run(batch_of_one(codes.states.view()), taps, tokens_->transform(), ctx_);
+    TokenSource& tokens = state_tokens_ ? *state_tokens_ : *tokens_;
+    states_->run(batch_of_one(codes.states.view()),
+                 state_tokens_ ? tokens.read(frame_of(scene_, frame)) : taps, tokens.transform(),
+                 ctx_);
   }
 
  private:
   const Scene& scene_;
   Context& ctx_;
-  std::unique_ptr<TokenSource> tokens_;
+  std::unique_ptr<TokenSource> tokens_, state_tokens_;
   std::optional<Decoder> language_, states_;
 };
 

@@ -146,6 +146,8 @@ void add_model_options(cli::Program& program, Options& options) {
   path("--config", run.config, "Configuration, if the decoders' metadata have none", ours);
   path("--tokens", run.tokens, "Tokens that make_tokens wrote; else <scene>/lvggt_tokens", ours,
        "DIR");
+  path("--state-tokens", run.state_tokens, "Those of the state decoder, if they are others", ours,
+       "DIR");
   path("--weights", run.weights, "Geometry weights, to make the tokens on the way", ours);
   app.add_option("--mode", run.mode, "How a picture becomes a model frame, with --weights")
       ->check(CLI::IsMember({"crop", "pad", "original"}))

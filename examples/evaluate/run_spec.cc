@@ -48,6 +48,7 @@ class RunReader {
         {"state-decoder", &run_.state_decoder},
         {"config", &run_.config},
         {"tokens", &run_.tokens},
+        {"state-tokens", &run_.state_tokens},
         {"weights", &run_.weights},
         {"field", &run_.field},
         {"state-renders", &run_.state_renders}};
@@ -118,6 +119,8 @@ void RunSpec::check() const {
   usage((ours ? 1 : 0) + (theirs ? 1 : 0) + (field.empty() ? 0 : 1) == 1,
         "exactly one source of features is needed: --decoder, --field or --renders");
   usage(tokens.empty() || weights.empty(), "--tokens and --weights exclude each other");
+  usage(state_tokens.empty() || (!state_decoder.empty() && weights.empty()),
+        "--state-tokens needs --state-decoder, and tokens instead of --weights");
   usage(ours || (tokens.empty() && weights.empty()), "--tokens and --weights need --decoder");
   usage(!text_encoder.empty(), "--text-encoder is needed for the phrases");
   usage(ours ? !decoder.empty() : true, "masks need --decoder; --state-decoder adds the states");

@@ -22,8 +22,9 @@ struct RunSpec {
   // Our model: decoders on tokens that are there already, or that the geometry weights make.
   std::string decoder, state_decoder, config;
   std::string tokens, weights, mode = "crop";
-  int size = 0;            // 0: the model's
-  bool stretched = false;  // decoders whose training targets were the pictures themselves
+  std::string state_tokens;  // of the state decoder, if they are others
+  int size = 0;              // 0: the model's
+  bool stretched = false;    // decoders whose training targets were the pictures themselves
   std::int64_t max_past_frames = 128;
   // Or what lift_video left of the scene's frames.
   std::string field;
