@@ -46,7 +46,10 @@
 //   io/        pictures, folders and preprocessing; safetensors; PLY, COLMAP, cameras.json, PNG
 //   geometry/  Camera, unprojection, confidence filter
 //   field/     coloured and language-featured clouds, colours of semantic maps, contact sheets
-//   kernels/   the operators the model is made of; not included here
+//   kernels/   the operators the model is made of; not included here, like what follows
+//   train/     the Semantic Bridging Decoder's backward pass, optimiser and trainer
+//   data/      labelled scenes, token caches, loaders
+//   language/  text and image encoders (link lvggt::text), autoencoders, queries, scores
 //
 // Shapes are written beside every declaration, channels last: [H, W, C] and [B, H, W, C].
 
