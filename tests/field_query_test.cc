@@ -30,7 +30,6 @@ Tensor<float, 2> unit_rows(std::int64_t n, std::int64_t width, std::uint32_t see
 struct Kept {
   std::int64_t question, level, pixels;
   float score, similarity;
-  friend bool operator==(const Kept&, const Kept&) = default;
 };
 
 std::vector<Kept> ask(const QuestionVectors& vectors, const DecodedCosines& decoder,

@@ -276,7 +276,9 @@ TEST_CASE(
       {{"--max-past-frames", "0"}, "--max-past-frames: '0'"},
       {{"--force", "--resume"}, "exclude each other"},
       {{"--start", "5"}, "5"}};
-  for (const auto& [options, message] : wrong) {
+  for (const auto& one : wrong) {
+    const auto& options = one.first;
+    const std::string& message = one.second;
     const Result result = scene.lift(options);
     INFO(options[0], ": ", result.err);
     CHECK(result.status == 2);
