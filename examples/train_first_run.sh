@@ -22,7 +22,7 @@ if [[ -z $weights ]]; then
 fi
 $bin/examples/make_tokens "$work/cup" --weights "$weights" --size 168 --out "$work/tokens" --force
 
-# The published shapes, but the stand-in sentences have 256 values instead of 4096. There are only five different vectors.
+# Words have the published shape; the stand-in sentences have 256 numbers instead of 4096, and a smaller autoencoder.
 $bin/examples/train_autoencoder "$work/cup" --supervision clip --learning-rate 2e-3 --epochs 400 \
   --encode --output "$work/autoencoder" --force
 $bin/examples/train_autoencoder "$work/cup" --supervision dynamic --learning-rate 2e-3 --epochs 400 \
