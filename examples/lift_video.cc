@@ -280,7 +280,6 @@ int lift_one(const LiftOptions& options, SharedModel& shared, const cli::Interru
   }
   say(concat(threads.threads, threads.threads == 1 ? " thread (" : " threads (", threads.reason,
              "), about ", cli::bytes_text(plan.total), " of memory (", breakdown(plan), ")"));
-  if (!files.checkpoint().all_f32()) say(files.checkpoint().storage_summary());
 
   Times times;
   const LangVggt& model = shared.get(times.load);
