@@ -308,15 +308,6 @@ bool winograd_pays(const Shape<4>& x, const ConvGeometry& geometry, std::int64_t
          out_channels >= 32 && x[1] * x[2] >= 1024;
 }
 
-std::size_t winograd_scratch_bytes(std::int64_t Cin, std::int64_t Cout, int num_threads) {
-  const std::int64_t T = chunk_tiles(Cin), blocks = (Cin + kBlockK - 1) / kBlockK;
-  const std::int64_t weights = num_panels(Cout) * kPanelWidth * kPositions * Cin * 4;
-  const std::int64_t worker =
-      4 * (kPositions * T * (Cin + kInputGap + kTurnPitch) + 4 * T * kSumPitch) +
-      8 * (kPositions * blocks * T + 3 * 4 * T);
-  return static_cast<std::size_t>(weights + num_threads * worker);
-}
-
 void run_winograd(View<float, 4> y, View<const float, 4> x, const PackedPanels& w,
                   const Epilogue<4>& epilogue, Context& ctx) {
   const auto [B, H, W, Cin] = x.shape();

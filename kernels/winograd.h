@@ -13,9 +13,6 @@ namespace lvggt::kernels {
 // its pictures one by one.
 bool winograd_pays(const Shape<4>& x, const ConvGeometry& geometry, std::int64_t out_channels);
 
-// Bytes of scratch of one call with Cin to Cout channels.
-std::size_t winograd_scratch_bytes(std::int64_t Cin, std::int64_t Cout, int num_threads);
-
 // run_conv2d for what winograd_pays() accepts; shapes are checked by the caller.
 void run_winograd(View<float, 4> y, View<const float, 4> x, const PackedPanels& w,
                   const Epilogue<4>& epilogue, Context& ctx);
