@@ -16,16 +16,15 @@ using namespace lvggt;
 // turns some small gradients' signs, which moves the next step's ReLU inputs. PyTorch's own float32
 // run of these three steps, against its float64 run, is off by 2e-2 in the norm of the second
 // gradient and 8e-2 in the third's, by 6e-2 in the whole first update and 0.19 in all three; in the
-// first update a tensor of 16 values with one sign turned is off by 2/4. The fourth loss is 2e-3 off
-// in our optimised build and 7e-3 in one that rounds differently. What does not pass through a step
-// is sharp.
+// first update a tensor of 16 values with one sign turned is off by 2/4. What does not pass through
+// a step is sharp.
 struct Limits {
   double loss = 1e-5;      // relative
   double output = 2e-4;    // largest error over largest value
   double gradient = 3e-2;  // by Euclidean norm; 2e-4 in train_small, where no ReLU input is near 0
   double statistics = 1e-5;  // after the first pass; later ones have seen the steps
   double later_statistics = 5e-2;
-  std::array<double, 4> losses{1e-5, 1e-3, 5e-3, 2e-2};
+  std::array<double, 4> losses{1e-5, 1e-3, 5e-3, 5e-3};
   std::array<double, 3> norms{1e-3, 5e-2, 0.1};
   double update = 5e-2, later_update = 0.2;  // of all parameters together
   double tensor_update = 0.6;                // of one
