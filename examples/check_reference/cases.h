@@ -16,7 +16,7 @@ void check_stream(Comparison& comparison, const lvggt::LoadOptions& load,
 void check_clip(Comparison& comparison, const lvggt::LoadOptions& load, lvggt::BatchMode mode,
                 lvggt::Context& ctx);
 
-// ops: single operators, forward and, where the decoder has them, backward.
+// ops: single operators and blocks, forward and backward.
 void check_ops(Comparison& comparison, lvggt::Context& ctx);
 
 // train, train_small, train_upstream_cos: losses, gradients and steps of the decoder. `inputs` is a

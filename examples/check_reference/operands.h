@@ -55,6 +55,14 @@ class Operands {
                     &y(n, head, std::int64_t{0}));
     return y;
   }
+  // The angles of rope2d.positions.
+  lvggt::RopeTable rope(std::int64_t head_dim) const {
+    comparison_.accept("rope2d.positions");
+    const std::vector<std::int64_t> values = file().read_int64("rope2d.positions");
+    lvggt::Tensor<std::int64_t, 2> positions(lvggt::Shape{std::ssize(values) / 2, std::int64_t{2}});
+    std::copy(values.begin(), values.end(), positions.data());
+    return lvggt::make_rope_table(positions, head_dim, 100);
+  }
   lvggt::Shape<4> output_shape() const {  // [B, H, W, C] of the file's [B, C, H, W]
     const std::vector<std::int64_t>& s = file().at(op_ + ".y").shape;
     LVGGT_CHECK(s.size() == 4, file().path(), ": ", op_, ".y is ", lvggt::shape_text(s),
@@ -81,13 +89,13 @@ class Operands {
     for (std::int64_t b = 0; b < B; ++b) lvggt::to_planes(planes[b], map[b], ctx_);
     compare(planes, name);
   }
-  void compare_heads(const lvggt::Tensor<float, 3>& y) const {
+  void compare_heads(const lvggt::Tensor<float, 3>& y, const std::string& name = "y") const {
     const auto [N, heads, D] = y.shape();
     lvggt::Tensor<float, 3> dump(lvggt::Shape{heads, N, D});
     for (std::int64_t n = 0; n < N; ++n)
       for (std::int64_t head = 0; head < heads; ++head)
         std::copy_n(&y(n, head, std::int64_t{0}), D, &dump(head, n, std::int64_t{0}));
-    compare(dump);
+    compare(dump, name);
   }
 
  private:
@@ -101,8 +109,10 @@ class Operands {
 };
 
 // The backward part of one operator: its gradients are computed from <op>.dy and the operands, and
-// compared. An operator that has none here is left alone.
+// compared. An operator that has none here is left alone. Those of the geometry encoder have a
+// function of their own.
 void check_op_backward(const Operands& operands);
+void check_transformer_backward(const Operands& operands);
 
 // loss_*: values and gradients.   The mask of the masked ones is loss_mask.m.
 void check_loss(const Operands& operands, Comparison& comparison);

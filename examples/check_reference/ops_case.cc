@@ -127,17 +127,10 @@ void check_attention(const Operands& o) {
   o.compare_heads(y);
 }
 
-RopeTable reference_rope(const Comparison& comparison, std::int64_t head_dim) {
-  const std::vector<std::int64_t> values = comparison.file().read_int64("rope2d.positions");
-  Tensor<std::int64_t, 2> positions(Shape{std::ssize(values) / 2, std::int64_t{2}});
-  std::copy(values.begin(), values.end(), positions.data());
-  return make_rope_table(positions, head_dim, 100);
-}
-
-void check_rope(const Operands& o, const RopeTable& table) {
+void check_rope(const Operands& o) {
   const Tensor<float, 3> x = o.get_heads("x");
   Tensor<float, 3> y(x.shape());
-  rope_2d_forward(y, x, table, o.ctx());
+  rope_2d_forward(y, x, o.rope(x.extent(2)), o.ctx());
   o.compare_heads(y);
 }
 
@@ -259,15 +252,6 @@ void check_cameras(const Operands& o, Comparison& comparison) {
   if (unprojects) comparison.compare("unproject.y", points);
 }
 
-// Why nothing is computed for a tensor, or null: the geometry model is frozen, so its operators
-// have no gradients.
-const char* why_skipped(const std::string& op, const std::string& field) {
-  static const char* const kFrozen[] = {"attention", "rope2d", "block_", "softmax", "activate_"};
-  const bool frozen = std::any_of(std::begin(kFrozen), std::end(kFrozen),
-                                  [&](const char* name) { return op.starts_with(name); });
-  return frozen && field.starts_with("d") ? "the geometry model is not trained" : nullptr;
-}
-
 void check_op(Comparison& comparison, const std::string& op, Context& ctx) {
   const Operands o(comparison, op, ctx);
   const auto starts = [&](const char* prefix) { return op.starts_with(prefix); };
@@ -285,12 +269,9 @@ void check_op(Comparison& comparison, const std::string& op, Context& ctx) {
   if (starts("bilinear")) return check_bilinear(o);
   if (starts("bicubic")) return check_bicubic(o);
   if (starts("attention")) return check_attention(o);
-  if (starts("rope2d")) {
-    comparison.accept("rope2d.positions");
-    return check_rope(o, reference_rope(comparison, comparison.file().at(op + ".x").shape.back()));
-  }
+  if (starts("rope2d")) return check_rope(o);
   if (op == "block_global") {
-    const RopeTable rope = reference_rope(comparison, 16);
+    const RopeTable rope = o.rope(16);
     return check_block(o, &rope);
   }
   if (op == "block_dino") return check_block(o, nullptr);
@@ -309,21 +290,14 @@ void check_op(Comparison& comparison, const std::string& op, Context& ctx) {
 
 void check_ops(Comparison& comparison, Context& ctx) {
   std::set<std::string> ops;
-  for (const TensorEntry& entry : comparison.file().entries()) {
-    const std::size_t dot = entry.name.find('.');
-    const std::string op = entry.name.substr(0, dot);
-    const char* why =
-        dot == std::string::npos ? nullptr : why_skipped(op, entry.name.substr(dot + 1));
-    if (why) {
-      comparison.skip(entry.name, why);
-    } else {
-      ops.insert(op);
-    }
-  }
+  for (const TensorEntry& entry : comparison.file().entries())
+    ops.insert(entry.name.substr(0, entry.name.find('.')));
   if (ops.erase("adamw") > 0) check_adamw(comparison, ctx);
   for (const std::string& op : ops) {
+    const Operands operands(comparison, op, ctx);
     check_op(comparison, op, ctx);
-    check_op_backward(Operands(comparison, op, ctx));
+    check_op_backward(operands);
+    check_transformer_backward(operands);
   }
 }
 

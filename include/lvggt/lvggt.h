@@ -47,7 +47,7 @@
 //   geometry/  Camera, unprojection, confidence filter
 //   field/     coloured and language-featured clouds, colours of semantic maps, contact sheets
 //   kernels/   the operators the model is made of; not included here, like what follows
-//   train/     the Semantic Bridging Decoder's backward pass, optimiser and trainer
+//   train/     the Semantic Bridging Decoder's training; backward passes of encoder blocks
 //   data/      labelled scenes, token caches, loaders
 //   language/  text and image encoders (link lvggt::text), autoencoders, queries, scores
 //
