@@ -12,6 +12,7 @@
 #include "lvggt/io/json.h"
 #include "lvggt/io/npy.h"
 #include "lvggt/language/autoencoder.h"
+#include "tests/support/files.h"
 #include "tests/support/paths.h"
 #include "tests/support/random.h"
 #include "tests/support/run_program.h"
@@ -101,10 +102,22 @@ TEST_CASE("train_autoencoder: trains, encodes for train_decoder, and goes on whe
   CHECK(again.status == 0);
   CHECK(again.says("complete already"));
   CHECK(again.says("0 of them written now"));
-  const ProgramResult refused = scene.run({"--autoencoder", file, "--encode"});
+
+  // make_features writes the same folder with an autoencoder that is there.
+  const auto make = [&](std::vector<std::string> more) {
+    more.insert(more.begin(), {scene.path(), "--threads", "1", "--autoencoder", file});
+    return run_program(program("make_features"), more);
+  };
+  const std::string codes_file = scene.compact() + "/000006_f.npy";
+  const std::string trained = read_bytes(codes_file);
+  const ProgramResult refused = make({});
   CHECK(refused.status == 2);
   CHECK(refused.says("holds codes already"));
-  CHECK(scene.run({"--autoencoder", file, "--encode", "--force"}).status == 0);
+  fs::remove(codes_file);
+  CHECK(make({"--resume"}).says("codes of 6 frames in clip_features-language_features_dim3, 1 of"));
+  CHECK(read_bytes(codes_file) == trained);
+  CHECK(make({"--force"}).says("6 of them written now"));
+  CHECK(read_bytes(codes_file) == trained);
 }
 
 TEST_CASE("train_autoencoder: the same autoencoder after an interruption") {

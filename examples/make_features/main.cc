@@ -7,8 +7,10 @@
 #include <memory>
 #include <set>
 
+#include "examples/load_autoencoder.h"
 #include "examples/make_features/options.h"
 #include "examples/make_features/pass.h"
+#include "lvggt/cli/progress.h"
 #include "lvggt/io/image.h"
 #include "lvggt/io/npy.h"
 #include "lvggt/language/captions.h"
@@ -174,33 +176,12 @@ class SentencePass {
   Pass pass_;
 };
 
-// The compact form of features that are there already.
-Pass compact_pass(const std::string& from, const std::string& folder, const std::string& path,
-                  const Autoencoder& autoencoder, Context& ctx) {
-  Pass pass;
-  pass.folder = folder;
-  pass.inputs = {cli::describe_input("autoencoder", path, true)};
-  pass.settings = {{"autoencoder", pass.inputs[0].sha256}};
-  pass.make = [from, &autoencoder, &ctx](const SceneFrame& frame, const std::string& stem) {
-    const NpyFile rows(from + "/" + frame.name + "_s.npy");
-    const NpyFile features(from + "/" + frame.name + "_f.npy");
-    const Tensor<float, 2> codes = encode_features(features.read<2>(), autoencoder, ctx);
-    write_features(stem, rows.read<3>(), codes, false);
-    return std::string();
-  };
-  return pass;
-}
-
-// Before anything is written: every frame has features, of the width that the autoencoder takes.
-void check_raw(const std::string& from, const std::vector<SceneFrame>& frames,
-               const std::string& path, const Autoencoder& autoencoder) {
-  for (const SceneFrame& frame : frames) {
-    const NpyFile rows(from + "/" + frame.name + "_s.npy");
-    const NpyFile features(from + "/" + frame.name + "_f.npy");
-    LVGGT_CHECK(features.shape().size() == 2 && features.shape()[1] == autoencoder.feature_width(),
-                features.path(), ": has the shape ", shape_text(features.shape()), ", but ", path,
-                " takes features of ", autoencoder.feature_width(), " numbers");
-  }
+// A frame's files in the folder of --out.
+FeatureFiles files_in(const std::string& base, const std::string& raw, const std::string& compact,
+                      const std::string& name) {
+  const std::string from = base + "/" + raw + "/" + name, to = base + "/" + compact;
+  return {from + "_s.npy", from + "_f.npy", to, to + "/" + name + "_s.npy",
+          to + "/" + name + "_f.npy"};
 }
 
 class Run {
@@ -233,9 +214,8 @@ class Run {
       SentencePass sentences(options_, *masks_, scene_, ctx_);
       status = work(sentences.pass(base_ + "/video_features"));
     }
-    if (status == 0) status = compact(Supervision::kClip, "clip_features", options_.autoencoder);
-    if (status == 0)
-      status = compact(Supervision::kDynamic, "video_features", options_.sentence_autoencoder);
+    if (status == 0) status = compact(Supervision::kClip, options_.autoencoder);
+    if (status == 0) status = compact(Supervision::kDynamic, options_.sentence_autoencoder);
     return status;
   }
 
@@ -250,13 +230,34 @@ class Run {
     return run_pass(pass, frames_, options_, threads_.threads, arguments_, interrupt_);
   }
 
-  int compact(Supervision kind, const std::string& raw, const std::string& path) {
+  // The compact form of features that are there already, or were made before.
+  int compact(Supervision kind, const std::string& path) {
     if (path.empty()) return 0;
-    const Autoencoder autoencoder = Autoencoder::load(path);
-    const SupervisionSpec spec{kind, autoencoder.code_width()};
-    if (!options_.dry_run) check_raw(base_ + "/" + raw, frames_, path, autoencoder);
-    return work(
-        compact_pass(base_ + "/" + raw, base_ + "/" + spec.folder(), path, autoencoder, ctx_));
+    const Autoencoder autoencoder = load_autoencoder(path);
+    const std::string folder = SupervisionSpec{kind, autoencoder.code_width()}.folder();
+    if (options_.dry_run) {
+      std::printf("%zu frames to %s\n", frames_.size(), folder.c_str());
+      return 0;
+    }
+    std::vector<FeatureFiles> files;
+    for (const SceneFrame& frame : frames_)
+      files.push_back(options_.out.empty()
+                          ? feature_files(scene_, frame, kind, autoencoder.code_width(), "")
+                          : files_in(base_, raw_feature_folder(kind), folder, frame.name));
+    cli::Progress progress(std::ssize(files));
+    std::int64_t done = 0;
+    const std::int64_t written = write_compact_codes(
+        files, autoencoder, path, options_.existing_codes(),
+        [&] {
+          progress.show(++done);
+          return !interrupt_.requested();
+        },
+        ctx_);
+    progress.clear();
+    const bool interrupted = done < std::ssize(files);
+    say(concat(interrupted ? "interrupted: " : "", "codes of ", done, " frames in ", folder, ", ",
+               written, " of them written now", interrupted ? "; --resume continues" : ""));
+    return interrupted ? exit_code(ErrorKind::kInterrupted) : 0;
   }
 
   const MakeFeaturesOptions& options_;

@@ -3,6 +3,7 @@
 
 #include <string>
 
+#include "examples/compact_codes.h"
 #include "lvggt/cli/output_folder.h"
 #include "lvggt/cli/program.h"
 #include "lvggt/cli/threads.h"
@@ -33,6 +34,10 @@ struct MakeFeaturesOptions {
   lvggt::cli::Existing existing() const {
     using lvggt::cli::Existing;
     return force ? Existing::kReplace : resume ? Existing::kResume : Existing::kRefuse;
+  }
+  lvggt::ExistingCodes existing_codes() const {
+    using lvggt::ExistingCodes;
+    return force ? ExistingCodes::kReplace : resume ? ExistingCodes::kKeep : ExistingCodes::kRefuse;
   }
 };
 
@@ -86,11 +91,13 @@ inline void add_make_features_options(lvggt::cli::Program& program, MakeFeatures
   app.add_option("--vocabulary", options.vocabulary,
                  "Its tokenizer.model, or the list of phrases of a .npy; else what is beside it")
       ->type_name("PATH");
-  app.add_option("--autoencoder", options.autoencoder,
-                 "Autoencoder of clip_features: makes their compact form")
+  app.add_option(
+         "--autoencoder", options.autoencoder,
+         "Autoencoder of clip_features (safetensors, .pth, .ckpt): makes their compact form; "
+         "train_autoencoder --encode does the same with the one it trains")
       ->type_name("FILE");
   app.add_option("--sentence-autoencoder", options.sentence_autoencoder,
-                 "Autoencoder of video_features: makes their compact form")
+                 "The same for video_features")
       ->type_name("FILE");
   app.add_option("--out", options.out, "Folder for the results; else the scene")->type_name("DIR");
   lvggt::cli::add_threads_option(program, options.threads);

@@ -3,8 +3,8 @@
 
 #include <algorithm>
 #include <cmath>
-#include <filesystem>
 
+#include "examples/compact_codes.h"
 #include "lvggt/io/hash.h"
 #include "lvggt/io/npy.h"
 
@@ -12,15 +12,6 @@ namespace train_autoencoder {
 namespace {
 
 using namespace lvggt;
-
-std::string raw_folder(Supervision kind) {
-  return kind == Supervision::kClip ? "clip_features" : "video_features";
-}
-
-bool is_there(const std::string& path) {
-  std::error_code error;
-  return std::filesystem::exists(path, error);
-}
 
 // One frame's features; rows of zeros are left out.
 void append_rows(std::vector<float>& rows, std::int64_t& empty, const std::string& path,
@@ -49,28 +40,6 @@ Tensor<float, 2> as_tensor(const std::vector<float>& rows, std::int64_t width) {
 
 }  // namespace
 
-FeatureFiles feature_files(const Scene& scene, const SceneFrame& frame, Supervision kind,
-                           std::int64_t code_width, const std::string& root) {
-  const std::string raw = raw_folder(kind);
-  const std::string compact = SupervisionSpec{kind, code_width}.folder();
-  const std::string base = root.empty() ? scene.path() : root;
-  struct Spelling {
-    std::string before, name;  // folders before the features' own, and the file name's stem
-  };
-  std::vector<Spelling> spellings{{"/", "/" + frame.name}};
-  if (scene.layout() == SceneLayout::kNeu3d)
-    spellings = {{"/cam00/", "/" + frame.name}, {"/", "/cam00-" + frame.name}};
-  for (const Spelling& spelling : spellings) {
-    const std::string stem = scene.path() + spelling.before + raw + spelling.name;
-    if (!is_there(stem + "_s.npy") || !is_there(stem + "_f.npy")) continue;
-    const std::string folder = base + spelling.before + compact;
-    return {stem + "_s.npy", stem + "_f.npy", folder, folder + spelling.name + "_s.npy",
-            folder + spelling.name + "_f.npy"};
-  }
-  fail(ErrorKind::kRead, scene.path(), spellings[0].before, raw, spellings[0].name,
-       "_s.npy or _f.npy is missing");
-}
-
 FeatureSet read_features(const std::vector<Scene>& scenes, Supervision kind, std::int64_t width,
                          const SplitOptions& split) {
   FeatureSet set;
@@ -92,7 +61,7 @@ FeatureSet read_features(const std::vector<Scene>& scenes, Supervision kind, std
     set.held_out_frames += std::ssize(parts.held_out);
   }
   if (std::ssize(train) < 2 * width)
-    fail(ErrorKind::kFormat, scenes.front().path(), ": ", raw_folder(kind),
+    fail(ErrorKind::kFormat, scenes.front().path(), ": ", raw_feature_folder(kind),
          " holds fewer than two features to learn from");
   set.train = as_tensor(train, width);
   set.held_out = as_tensor(held_out, width);

@@ -12,19 +12,6 @@
 
 namespace train_autoencoder {
 
-// The two files of a frame before the autoencoder: label map and features of full width.
-struct FeatureFiles {
-  std::string labels, features;
-  // Where the same frame's files with compact codes belong.
-  std::string compact_folder, compact_labels, compact_features;
-};
-
-// The files of a frame; Neu3D ones are found under both spellings. `root` is the folder that the
-// compact ones go to, the scene's own if empty. Errors: kRead for a missing file.
-FeatureFiles feature_files(const lvggt::Scene& scene, const lvggt::SceneFrame& frame,
-                           lvggt::Supervision kind, std::int64_t code_width,
-                           const std::string& root);
-
 // Features to learn from and to test on.
 struct FeatureSet {
   lvggt::Tensor<float, 2> train, held_out;  // [N, D]

@@ -6,8 +6,7 @@
 #include <filesystem>
 #include <optional>
 
-#include "examples/load_autoencoder.h"
-#include "examples/train_autoencoder/encode.h"
+#include "examples/compact_codes.h"
 #include "examples/train_autoencoder/features.h"
 #include "examples/train_autoencoder/options.h"
 #include "examples/train_autoencoder/session.h"
@@ -177,20 +176,22 @@ bool train(const Options& options, const std::vector<Scene>& scenes,
 // Writes the codes of all scenes; false when it was interrupted.
 bool encode(const Options& options, const std::vector<Scene>& scenes,
             const cli::InterruptGuard& interrupt, Context& ctx) {
-  const std::string file =
-      options.autoencoder.empty() ? options.output + "/" + kAutoencoderFile : options.autoencoder;
-  const Autoencoder autoencoder = load_autoencoder(file);
-  if (!autoencoder.has_encoder())
-    fail(ErrorKind::kMismatch, file, ": holds a decoder only, which cannot encode");
+  const std::string file = options.output + "/" + kAutoencoderFile;
+  const Autoencoder autoencoder = Autoencoder::load(file);
+  const ExistingCodes existing = options.force    ? ExistingCodes::kReplace
+                                 : options.resume ? ExistingCodes::kKeep
+                                                  : ExistingCodes::kRefuse;
   std::int64_t frames = 0, done = 0, written = 0;
   for (const Scene& scene : scenes) frames += std::ssize(scene.frames());
   cli::Progress progress(frames);
   for (const Scene& scene : scenes) {
-    EncodeOptions encode{options.kind(), options.encode_root, sha256_file(file), options.force,
-                         options.resume};
-    if (!encode.root.empty() && scenes.size() > 1) encode.root += "/" + scene.name();
-    written += encode_scene(
-        scene, autoencoder, encode,
+    std::string root = options.encode_root;
+    if (!root.empty() && scenes.size() > 1) root += "/" + scene.name();
+    std::vector<FeatureFiles> files;
+    for (const SceneFrame& frame : scene.frames())
+      files.push_back(feature_files(scene, frame, options.kind(), autoencoder.code_width(), root));
+    written += write_compact_codes(
+        files, autoencoder, file, existing,
         [&] {
           progress.show(++done);
           return !interrupt.requested();
@@ -221,8 +222,7 @@ int run(Options& options, int argc, char** argv) {
   const cli::ThreadChoice threads = cli::choose_threads(options.threads);
   Context ctx(threads.threads);
   const std::vector<std::string> arguments(argv + 1, argv + argc);
-  if (options.autoencoder.empty() && !train(options, scenes, interrupt, ctx, arguments))
-    return exit_code(ErrorKind::kInterrupted);
+  if (!train(options, scenes, interrupt, ctx, arguments)) return exit_code(ErrorKind::kInterrupted);
   if (options.dry_run || !options.encode) return 0;
   return encode(options, scenes, interrupt, ctx) ? 0 : exit_code(ErrorKind::kInterrupted);
 }

@@ -18,12 +18,7 @@ void Options::settle() {
     for (std::string& scene : read_list_file(list)) scenes.push_back(std::move(scene));
   usage(!scenes.empty(), "give at least one scene, as an argument or in --list");
   kind();
-  const bool trains = autoencoder.empty();
-  usage(trains != output.empty(), trains ? "--output names the folder of the training; or give "
-                                           "--autoencoder to encode only"
-                                         : "--autoencoder encodes without training, so --output "
-                                           "has no meaning");
-  usage(trains || encode, "--autoencoder without --encode leaves nothing to do");
+  usage(!output.empty(), "--output names the folder of the training");
   usage(encode_root.empty() || encode, "--encode-root needs --encode");
   usage(!resume || !force, "--resume and --force exclude each other");
   usage(candidates <= epochs, "--candidates is ", candidates, " of only ", epochs, " epochs");
@@ -124,16 +119,12 @@ void add_encoding_options(cli::Program& program, Options& options) {
   const std::string group = "Encoding";
   app.add_flag("--encode", options.encode,
                "Afterwards write the features of all frames in compact form, into the folder that "
-               "train_decoder reads")
+               "train_decoder reads; make_features does so with an autoencoder from elsewhere")
       ->group(group);
   app.add_option("--encode-root", options.encode_root,
                  "Write them there instead of into the scene; for several scenes, into a folder of "
                  "each one's name")
       ->type_name("DIR")
-      ->group(group);
-  app.add_option("--autoencoder", options.autoencoder,
-                 "Encode with this one (safetensors, .pth, .ckpt), without training")
-      ->type_name("FILE")
       ->group(group);
 }
 

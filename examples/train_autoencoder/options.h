@@ -26,8 +26,7 @@ struct Options {
   std::int64_t batch = 64, epochs = 100, candidates = 9;
   std::uint64_t seed = 0;
 
-  std::string output;       // folder of the training
-  std::string autoencoder;  // encode with this one instead of training
+  std::string output;  // folder of the training
   bool encode = false;
   std::string encode_root;
   bool resume = false, force = false, dry_run = false;
