@@ -4,116 +4,22 @@
 
 #include <algorithm>
 #include <filesystem>
-#include <map>
 #include <string>
 #include <thread>
 #include <vector>
 
-#include "lvggt/core/tensor.h"
-#include "lvggt/field/lifted_field.h"
 #include "lvggt/io/hash.h"
-#include "lvggt/io/json.h"
-#include "lvggt/io/png.h"
-#include "tests/support/child_process.h"
-#include "tests/support/files.h"
-#include "tests/support/paths.h"
-#include "tests/support/temp_dir.h"
+#include "tests/support/lift_scene.h"
 #include "tests/support/tiny_model.h"
 
 using namespace lvggt;
+using test::contents;
+using test::LiftScene;
+using Result = test::ProgramResult;
 namespace fs = std::filesystem;
 
-namespace {
-
-struct Result {
-  int status = 0;
-  std::string out, err;
-  bool says(const std::string& text) const { return err.find(text) != std::string::npos; }
-};
-
-Result finish(test::ChildProcess& child) {
-  const int status = child.wait();
-  return {status, child.out(), child.err()};
-}
-
-// A folder with a small model, in one file and in two, and with pictures of 84 x 56 pixels.
-class Scene {
- public:
-  explicit Scene(int num_frames = 3) {
-    init({"--config", lvggt::test::test_data("golden/config_tiny.json"), "--seed", "1",
-          dir_ / "model.safetensors"});
-    fs::create_directory(dir_ / "frames");
-    for (int i = 0; i < num_frames; ++i) add_picture("img" + std::to_string(i) + ".png", 56, 84, i);
-  }
-
-  void init(std::vector<std::string> arguments) {
-    arguments.insert(arguments.begin(), lvggt::test::program("weights_init"));
-    test::ChildProcess child(arguments);
-    const Result result = finish(child);
-    INFO(result.err);
-    REQUIRE(result.status == 0);
-  }
-
-  void add_picture(const std::string& name, std::int64_t H, std::int64_t W, int seed) {
-    Tensor<std::uint8_t, 3> pixels(Shape{H, W, std::int64_t{3}});
-    for (std::int64_t y = 0; y < H; ++y)
-      for (std::int64_t x = 0; x < W; ++x)
-        for (std::int64_t c = 0; c < 3; ++c)
-          pixels(y, x, c) = static_cast<std::uint8_t>((x * (c + 1) + 3 * y + 20 * seed) % 256);
-    write_png(dir_ / ("frames/" + name), pixels);
-  }
-
-  std::string operator/(const std::string& name) const { return dir_ / name; }
-
-  // The command: frames to "out" with the model in one file, and more options.
-  std::vector<std::string> command(const std::vector<std::string>& more = {}) const {
-    std::vector<std::string> argv{lvggt::test::program("lift_video"),
-                                  dir_ / "frames",
-                                  "--weights",
-                                  dir_ / "model.safetensors",
-                                  "--out",
-                                  dir_ / "out",
-                                  "--mode",
-                                  "original",
-                                  "--threads",
-                                  "2"};
-    argv.insert(argv.end(), more.begin(), more.end());
-    return argv;
-  }
-  Result lift(const std::vector<std::string>& more = {}) const {
-    test::ChildProcess child(command(more));
-    return finish(child);
-  }
-  // With the whole argument list.
-  Result run(std::vector<std::string> arguments) const {
-    arguments.insert(arguments.begin(), lvggt::test::program("lift_video"));
-    test::ChildProcess child(arguments);
-    return finish(child);
-  }
-
-  Json json(const std::string& name) const { return Json::read(dir_ / name); }
-  std::string status() const {
-    const Json record = json("out/run.json");
-    return record.find("status")->as_string("status");
-  }
-
- private:
-  test::TempDir dir_;
-};
-
-// All files below a folder with their bytes, except the record of the run, which holds times.
-std::map<std::string, std::string> contents(const std::string& folder) {
-  std::map<std::string, std::string> files;
-  for (const auto& entry : fs::recursive_directory_iterator(folder))
-    if (entry.is_regular_file() && entry.path().filename() != "run.json")
-      files[fs::relative(entry.path(), folder).string()] = test::read_bytes(entry.path().string());
-  return files;
-}
-
-}  // namespace
-
 TEST_CASE("lift_video: writes every output of every frame, under its final name only") {
-  const Scene scene;
+  const LiftScene scene;
   const Result result = scene.lift({"--images", "--summary", scene / "summary.json"});
   INFO(result.err);
   REQUIRE(result.status == 0);
@@ -145,7 +51,7 @@ TEST_CASE("lift_video: writes every output of every frame, under its final name 
 }
 
 TEST_CASE("lift_video: outputs can be left out, and every n-th frame chosen") {
-  const Scene scene;
+  const LiftScene scene;
   const Result result = scene.lift({"--no-ply", "--no-depth", "--no-confidence", "--no-rgb",
                                     "--no-contact-sheet", "--no-frames", "--every", "2"});
   REQUIRE(result.status == 0);
@@ -166,7 +72,7 @@ TEST_CASE("lift_video: outputs can be left out, and every n-th frame chosen") {
 TEST_CASE(
     "lift_video: one file or two, one thread or three give the same bytes; geometry alone is "
     "said") {
-  Scene scene;
+  LiftScene scene;
   scene.init({"--config", lvggt::test::test_data("golden/config_tiny.json"), "--seed", "1",
               "--decoder-out", scene / "decoder.safetensors", scene / "geometry.safetensors"});
   REQUIRE(scene.lift().status == 0);
@@ -192,68 +98,9 @@ TEST_CASE(
   CHECK(files.at("depth/000001.png") == contents(scene / "out").at("depth/000001.png"));
 }
 
-TEST_CASE("lift_video: a decoder, a state decoder or both run on one pass of the geometry") {
-  Scene scene(2);
-  ModelConfig config = load_config(lvggt::test::test_data("golden/config_tiny.json"));
-  scene.init({"--config", lvggt::test::test_data("golden/config_tiny.json"), "--seed", "1",
-              "--decoder-out", scene / "decoder.safetensors", scene / "geometry.safetensors"});
-  config.sbd_levels = 1;
-  config.lang_dim = 6;
-  test::write_tensors(scene / "states.safetensors", decoder_tensors(config), &config);
-  const auto lift = [&](const std::string& out, std::vector<std::string> more) {
-    more.insert(more.begin(), {scene / "frames", "--mode", "original", "--out", scene / out,
-                               "--weights", scene / "geometry.safetensors"});
-    return scene.run(more);
-  };
-  const std::string decoder = scene / "decoder.safetensors", states = scene / "states.safetensors";
-  const Result both = lift("both", {"--decoder", decoder, "--state-decoder", states});
-  INFO(both.err);
-  REQUIRE(both.status == 0);
-  REQUIRE(lift("decoder", {"--decoder", decoder}).status == 0);
-  REQUIRE(lift("states", {"--state-decoder", states}).status == 0);
-  const auto all = contents(scene / "both"), one = contents(scene / "decoder"),
-             other = contents(scene / "states");
-  for (const char* name : {"codes/000001.safetensors", "depth/000001.png", "points/000001.ply",
-                           "semantics_large/000001.png", "rgb/000001.png"})
-    CHECK_MESSAGE(all.at(name) == one.at(name), name);
-  for (const char* name : {"state_codes/000001.safetensors", "semantics_state/000001.png"})
-    CHECK_MESSAGE(all.at(name) == other.at(name), name);
-  CHECK(one.count("state_codes/000001.safetensors") == 0);
-  CHECK(other.count("codes/000001.safetensors") == 0);
-  CHECK(other.count("rgb/000001.png") == 1);  // of the state decoder
-  const LiftedField field = LiftedField::open(scene / "both");
-  CHECK(field.codes(CodesKind::kState).dim == 6);
-  CHECK(field.codes(CodesKind::kLanguage).decoder_sha256.size() == 64);
-  CHECK(test::read_bytes(scene / "both/run.json").find("\"role\": \"state_decoder\"") !=
-        std::string::npos);
-
-  REQUIRE(lift("none", {"--decoder", decoder, "--state-decoder", states, "--no-codes"}).status ==
-          0);
-  CHECK(contents(scene / "none").count("codes/000000.safetensors") == 0);
-  CHECK_FALSE(LiftedField::open(scene / "none").has_codes(CodesKind::kState));
-  const Result plan = lift("none", {"--state-decoder", states, "--dry-run"});
-  CHECK(plan.out.find("the state decoder (1 x 6)") != std::string::npos);
-  CHECK(plan.out.find("a frame, for queries") != std::string::npos);
-}
-
-TEST_CASE("lift_video: a state decoder of another model, or none, is refused by name") {
-  Scene scene(1);
-  ModelConfig config = load_config(lvggt::test::test_data("golden/config_tiny.json"));
-  config.sbd_levels = 1;
-  config.taps[3] -= 1;
-  test::write_tensors(scene / "other.safetensors", decoder_tensors(config), &config);
-  const Result other = scene.lift({"--state-decoder", scene / "other.safetensors"});
-  CHECK(other.status == 3);
-  CHECK(other.says("other.safetensors: was made for another geometry model"));
-  const Result model = scene.lift({"--state-decoder", scene / "missing.safetensors"});
-  CHECK(model.status == 3);
-  CHECK(model.says("missing.safetensors"));
-  CHECK_FALSE(fs::exists(scene / "out"));
-}
-
 TEST_CASE(
     "D01: wrong options of lift_video are refused by name with status 2, and nothing is written") {
-  const Scene scene(1);
+  const LiftScene scene(1);
   CHECK(scene.run({}).status == 2);
   CHECK(scene.run({"--help"}).status == 0);
   CHECK(scene.run({"--version"}).out.find("lift_video") == 0);
@@ -291,7 +138,7 @@ TEST_CASE(
 }
 
 TEST_CASE("D02: an output folder that is not free is refused and stays as it was") {
-  const Scene scene(1);
+  const LiftScene scene(1);
   const auto lift_to = [&](const std::string& out, std::vector<std::string> more = {}) {
     more.insert(more.begin(), {scene / "frames", "--weights", scene / "model.safetensors", "--mode",
                                "original", "--out", out});
@@ -324,7 +171,7 @@ TEST_CASE("D02: an output folder that is not free is refused and stays as it was
 }
 
 TEST_CASE("D02: --force replaces an earlier run and leaves foreign files alone") {
-  const Scene scene(3);
+  const LiftScene scene(3);
   REQUIRE(scene.lift().status == 0);
   test::write_bytes(scene / "out/depth/notes.txt", "mine");
   test::write_bytes(scene / "out/notes.txt", "mine");
@@ -339,7 +186,7 @@ TEST_CASE("D02: --force replaces an earlier run and leaves foreign files alone")
 
 TEST_CASE(
     "lift_video: weights that are missing, empty, cut short or none are bad input, status 3") {
-  const Scene scene(1);
+  const LiftScene scene(1);
   test::write_bytes(scene / "empty.safetensors", "");
   const std::string model = test::read_bytes(scene / "model.safetensors");
   test::write_bytes(scene / "cut.safetensors", model.substr(0, model.size() / 2));
@@ -356,7 +203,7 @@ TEST_CASE(
 }
 
 TEST_CASE("lift_video: input that is missing, empty or without frames is status 3") {
-  const Scene scene(1);
+  const LiftScene scene(1);
   fs::create_directory(scene / "nothing");
   test::write_bytes(scene / "empty.mp4", "");
   test::write_bytes(scene / "text.mp4", "this is no video");
@@ -373,7 +220,7 @@ TEST_CASE("lift_video: input that is missing, empty or without frames is status 
 
 TEST_CASE(
     "C17: a frame of another size ends the run, is named, and what is complete stays usable") {
-  Scene scene(2);
+  LiftScene scene(2);
   scene.add_picture("img2.png", 70, 84, 2);
   const Result result = scene.lift();
   CHECK(result.status == 3);
@@ -384,7 +231,7 @@ TEST_CASE(
 }
 
 TEST_CASE("D40: a run over --memory-limit is refused before it starts, with what would fit") {
-  const Scene scene;
+  const LiftScene scene;
   const Result result = scene.lift({"--memory-limit", "1M"});
   CHECK(result.status == 4);
   CHECK(result.says("--memory-limit"));
@@ -393,7 +240,7 @@ TEST_CASE("D40: a run over --memory-limit is refused before it starts, with what
 }
 
 TEST_CASE("lift_video: --dry-run prints the plan and writes nothing") {
-  const Scene scene;
+  const LiftScene scene;
   const Result result = scene.lift({"--dry-run"});
   CHECK(result.status == 0);
   CHECK(result.out.find("3 frames of 84 x 56") != std::string::npos);
@@ -403,7 +250,7 @@ TEST_CASE("lift_video: --dry-run prints the plan and writes nothing") {
 
 TEST_CASE(
     "D07: SIGINT finishes the file at hand, exit 130; --resume gives what one run would have") {
-  const Scene scene(24);
+  const LiftScene scene(24);
   const Result uninterrupted =
       scene.run({scene / "frames", "--weights", scene / "model.safetensors", "--mode", "original",
                  "--out", scene / "whole"});
@@ -440,7 +287,7 @@ TEST_CASE(
 }
 
 TEST_CASE("C21: a video that ends early gives the frames there are, status 5, and says so") {
-  const Scene scene(0);
+  const LiftScene scene(0);
   const std::string clip = test::read_bytes(lvggt::test::test_data("../examples/data/cup_24.mp4"));
   test::write_bytes(scene / "cut.mp4", clip.substr(0, clip.size() / 3));
   const Result result = scene.run({scene / "cut.mp4", "--weights", scene / "model.safetensors",
@@ -457,7 +304,7 @@ TEST_CASE("C21: a video that ends early gives the frames there are, status 5, an
 }
 
 TEST_CASE("D09: a disk that is full ends the run with status 1 and leaves no cut file") {
-  const Scene scene;
+  const LiftScene scene;
   test::ChildProcess child(scene.command({"--no-codes"}), 60'000);  // a point cloud has more
   const Result result = finish(child);
   INFO(result.err);
@@ -469,7 +316,7 @@ TEST_CASE("D09: a disk that is full ends the run with status 1 and leaves no cut
 }
 
 TEST_CASE("A60: weights whose SHA-256 is not the one given are refused, and nothing is written") {
-  const Scene scene(1);
+  const LiftScene scene(1);
   const Result wrong = scene.lift({"--sha256", std::string(64, 'a')});
   CHECK(wrong.status == 3);
   CHECK(wrong.says("model.safetensors"));
@@ -479,7 +326,7 @@ TEST_CASE("A60: weights whose SHA-256 is not the one given are refused, and noth
 }
 
 TEST_CASE("lift_video: kept frames are recorded in the settings of the run") {
-  const Scene scene;
+  const LiftScene scene;
   REQUIRE(
       scene.lift({"--max-past-frames", "2", "--keep-first-frame", "--keep-every", "2"}).status ==
       0);
