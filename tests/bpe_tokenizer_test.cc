@@ -6,6 +6,7 @@
 #include <functional>
 
 #include "lvggt/io/json.h"
+#include "tests/support/bpe_files.h"
 #include "tests/support/safetensors_bytes.h"
 
 using namespace lvggt;
@@ -15,44 +16,11 @@ namespace {
 
 // A vocabulary in the published forms: the bytes, the bytes at a word's end, six merges, and the
 // two special tokens, 520 in all.
-const std::vector<std::pair<std::string, std::string>> kMerges = {
-    {"t", "h"}, {"th", "e</w>"}, {"c", "u"}, {"cu", "p</w>"}, {"'", "s</w>"}, {"a", "b"}};
+const BpeMerges kMerges = {{"t", "h"},      {"th", "e</w>"}, {"c", "u"},
+                           {"cu", "p</w>"}, {"'", "s</w>"},  {"a", "b"}};
 
-std::string code_point(int c) {
-  if (c < 0x80) return std::string(1, static_cast<char>(c));
-  return {static_cast<char>(0xC0 | c >> 6), static_cast<char>(0x80 | (c & 0x3F))};
-}
-
-std::vector<std::string> symbols() {
-  std::vector<std::string> all;
-  const auto prints = [](int b) { return (b >= 33 && b <= 126) || (b >= 161 && b != 173); };
-  for (int b = 0; b < 256; ++b)
-    if (prints(b)) all.push_back(code_point(b));
-  for (int next = 256; all.size() < 256; ++next) all.push_back(code_point(next));
-  return all;
-}
-
-std::vector<std::string> vocabulary() {
-  std::vector<std::string> tokens = symbols();
-  for (const std::string& symbol : symbols()) tokens.push_back(symbol + "</w>");
-  for (const auto& [left, right] : kMerges) tokens.push_back(left + right);
-  tokens.push_back("<|startoftext|>");
-  tokens.push_back("<|endoftext|>");
-  return tokens;
-}
-
-std::string vocabulary_json(const std::vector<std::string>& tokens) {
-  std::string text = "{";
-  for (std::size_t i = 0; i < tokens.size(); ++i)
-    text += (i == 0 ? "" : ", ") + json_quote(tokens[i]) + ": " + std::to_string(i);
-  return text + "}";
-}
-
-std::string merges_text(const char* line_end) {
-  std::string text = std::string("#version: 0.2") + line_end;
-  for (const auto& [left, right] : kMerges) text += left + " " + right + line_end;
-  return text;
-}
+std::vector<std::string> vocabulary() { return bpe_vocabulary(kMerges); }
+std::string merges_text(const char* line_end) { return bpe_merges_text(kMerges, line_end); }
 
 struct Folder {
   TempDir dir;

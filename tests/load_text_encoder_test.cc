@@ -6,6 +6,8 @@
 #include <filesystem>
 
 #include "lvggt/io/npy.h"
+#include "tests/support/bpe_files.h"
+#include "tests/support/files.h"
 #include "tests/support/golden.h"
 #include "tests/support/paths.h"
 #include "tests/support/safetensors_bytes.h"
@@ -34,6 +36,22 @@ void write_mistral(const std::string& folder, std::int64_t vocabulary) {
   out.finish();
   write_file(folder + "/config.json", R"({"model_type": "mistral", "head_dim": 16})");
   std::filesystem::copy_file(kFolder + "sentence_piece.model", folder + "/tokenizer.model");
+}
+
+// CLIP's tiny weights, whose token embedding has 600 rows, as a published folder with a vocabulary
+// of 514 + merges tokens.
+void write_clip(const std::string& folder, int merges) {
+  std::filesystem::copy_file(kFolder + "weights_clip_tiny_seed1.safetensors",
+                             folder + "/open_clip_model.safetensors",
+                             std::filesystem::copy_options::overwrite_existing);
+  write_file(folder + "/open_clip_config.json", R"({"vision_cfg": {"width": 48, "head_width": 16},
+      "text_cfg": {"heads": 4}})");
+  BpeMerges pairs;
+  for (int i = 0; i < merges; ++i)
+    pairs.emplace_back(std::string(1, static_cast<char>('a' + i / 10)),
+                       std::string(1, static_cast<char>('a' + i % 10)));
+  write_file(folder + "/vocab.json", vocabulary_json(bpe_vocabulary(pairs)));
+  write_file(folder + "/merges.txt", bpe_merges_text(pairs, "\n"));
 }
 
 }  // namespace
@@ -83,6 +101,35 @@ TEST_CASE("load_text_encoder: a vocabulary that is not the model's is refused wi
   CHECK(outcome.kind == ErrorKind::kMismatch);
   CHECK(outcome.says("the vocabulary has 320 tokens, but embed_tokens of"));
   CHECK(outcome.says("has 321 rows"));
+}
+
+TEST_CASE("B26 load_text_encoder: a CLIP folder's vocabulary has to be that of its embedding") {
+  const TempDir dir;
+  write_clip(dir.path(), 86);
+  CHECK(load_text_encoder(dir.path())->width() == 24);
+  for (const int merges : {6, 85, 87}) {
+    write_clip(dir.path(), merges);
+    const Outcome outcome = outcome_of([&] { load_text_encoder(dir.path()); });
+    CAPTURE(outcome.message);
+    CHECK(outcome.kind == ErrorKind::kMismatch);
+    CHECK(outcome.says(dir / "vocab.json"));
+    CHECK(outcome.says(
+        concat("the vocabulary has ", 514 + merges, " tokens, but token_embedding of")));
+    CHECK(outcome.says(dir / "open_clip_model.safetensors"));
+    CHECK(outcome.says("has 600 rows"));
+  }
+}
+
+TEST_CASE("B26 load_text_encoder: a CLIP folder's merges cut short are refused with both numbers") {
+  const TempDir dir;
+  write_clip(dir.path(), 86);
+  const std::string merges = read_bytes(dir / "merges.txt");
+  write_file(dir / "merges.txt", merges.substr(0, merges.size() - 4 * 20));
+  const Outcome outcome = outcome_of([&] { load_text_encoder(dir.path()); });
+  CAPTURE(outcome.message);
+  CHECK(outcome.kind == ErrorKind::kMismatch);
+  CHECK(outcome.says(dir / "merges.txt"));
+  CHECK(outcome.says("has 66 merges, but the vocabulary of 600 tokens needs 86"));
 }
 
 TEST_CASE("SentencePieceTokenizer: <s>, pieces, </s>; cut before the end, odd files refused") {

@@ -195,10 +195,10 @@ void add_merges_text(BpeBuilder& builder, const std::string& path) {
   }
 }
 
-BpeTokenizer open_pair(const std::string& path, const fs::path& folder) {
+BpeTokenizer open_pair(const fs::path& folder) {
   const std::string vocabulary = (folder / "vocab.json").string();
   const std::string merges = (folder / "merges.txt").string();
-  BpeBuilder builder(path);
+  BpeBuilder builder(vocabulary);
   builder.add_vocabulary(Json::read(vocabulary), vocabulary);
   add_merges_text(builder, merges);
   return builder.finish(merges);
@@ -249,14 +249,14 @@ BpeTokenizer BpeTokenizer::open(const std::string& path) {
     const std::string name = fs::path(path).filename().string();
     if (name.ends_with(".gz")) return open_gz(path);
     if (name == "merges.txt" || name == "vocab.json")
-      return open_pair(path, fs::path(path).parent_path());
+      return open_pair(fs::path(path).parent_path());
     return open_tokenizer_json(path);
   }
   const fs::path folder = path;
   if (fs::exists(folder / "tokenizer.json", ignored))
     return open_tokenizer_json((folder / "tokenizer.json").string());
   if (fs::exists(folder / "vocab.json", ignored) || fs::exists(folder / "merges.txt", ignored))
-    return open_pair(path, folder);
+    return open_pair(folder);
   if (fs::exists(folder / kGzName, ignored)) return open_gz((folder / kGzName).string());
   fail(ErrorKind::kRead, path, ": holds none of tokenizer.json, vocab.json with merges.txt, and ",
        kGzName);

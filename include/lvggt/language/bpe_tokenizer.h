@@ -22,7 +22,7 @@ class BpeTokenizer {
   // the vocabulary needs are not there: a file cut short), kLimit.
   static BpeTokenizer open(const std::string& path);
 
-  // The file or folder open() was given.
+  // The file that holds the vocabulary.
   const std::string& path() const { return path_; }
   std::int64_t vocabulary_size() const { return static_cast<std::int64_t>(num_ids_); }
   std::int64_t start_token() const { return start_; }
