@@ -322,6 +322,24 @@ TEST_CASE("query_video: asks a folder of pictures directly, which it lifts first
   CHECK(ask({"--out", asked / "out", "--force"}).status == 0);
 }
 
+TEST_CASE("D40 query_video: more memory than --memory-limit is refused, and nothing is written") {
+  const Asked asked;
+  const std::vector<std::vector<std::string>> runs{
+      {"cup", "--out", asked / "out"}, {"cup", "--dry-run"}, {"--interactive"}};
+  for (std::vector<std::string> run : runs) {
+    run.insert(run.end(), {"--memory-limit", "1M"});
+    const Result result = asked.ask(run);
+    CAPTURE(result.err);
+    CHECK(result.status == 4);
+    CHECK(result.says("the run needs about "));
+    CHECK(result.says(" with the encoders and autoencoders, "));
+    CHECK(result.says("but it may have 1.0 MiB (--memory-limit)"));
+  }
+  CHECK_FALSE(fs::exists(asked / "out"));
+  CHECK(asked.ask({"cup", "--memory-limit", "100G"}).status == 0);
+  CHECK(asked.ask({"cup", "--memory-limit", "much"}).status == 2);
+}
+
 TEST_CASE("query_video: --dry-run says what the field holds and writes nothing") {
   const Asked asked;
   const Result result = asked.ask({"cup", "--dry-run", "--out", asked / "out"});

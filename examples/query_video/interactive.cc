@@ -10,7 +10,6 @@
 #include <optional>
 
 #include "lvggt/cli/interrupt.h"
-#include "lvggt/cli/memory.h"
 #include "lvggt/cli/progress.h"
 #include "lvggt/model/stage_times.h"
 
@@ -111,9 +110,9 @@ void answer(Session& session, const std::string& line, const std::string& out, s
 
 }  // namespace
 
-int converse(Session& session, const std::string& out, Context& ctx) {
+int converse(Session& session, const std::string& out, std::size_t memory, Context& ctx) {
   const cli::InterruptGuard interrupt;
-  session.keep_codes(std::min(kKeptCodes, cli::available_memory().bytes / 2));
+  session.keep_codes(std::min(kKeptCodes, memory / 2));
   const bool person = isatty(STDIN_FILENO) == 1;
   if (person)
     say("type what to look for, or \"state: ...\" for when something holds; the end of the input "

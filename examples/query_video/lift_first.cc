@@ -24,6 +24,7 @@ LiftOptions lift_options_of(const Options& o, const std::string& folder) {
   lift.weights.state_decoder = o.state_decoder;
   lift.weights.config = o.config;
   lift.stream.max_past_frames = o.max_past_frames;
+  lift.memory_limit = o.memory_limit;
   lift.no_ply = lift.no_rgb = lift.no_semantics = lift.no_colmap = lift.no_contact_sheet = true;
   lift.settle();
   lift.stream.rgb = false;

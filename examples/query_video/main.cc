@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // Asks a lifted video in words: where is it, and when does it happen?
+#include <algorithm>
 #include <cstdio>
 #include <filesystem>
 #include <string>
@@ -9,6 +10,7 @@
 #include "examples/query_video/options.h"
 #include "examples/query_video/session.h"
 #include "lvggt/cli/interrupt.h"
+#include "lvggt/cli/memory_check.h"
 #include "lvggt/cli/output_folder.h"
 #include "lvggt/cli/progress.h"
 #include "lvggt/cli/run_record.h"
@@ -122,6 +124,24 @@ void print_plan(const Options& o, const Session& session) {
       cli::bytes_text(cli::resident_bytes() + session.planned_bytes(o.questions.size())).c_str());
 }
 
+// What it may have, counting what it holds already.
+cli::MemoryLimit memory_limit(const Options& o) {
+  cli::MemoryLimit limit = cli::available_memory();
+  limit.bytes += std::min(cli::resident_bytes(), ~limit.bytes);
+  if (o.memory_limit > 0 && o.memory_limit < limit.bytes)
+    limit = {o.memory_limit, "--memory-limit"};
+  return limit;
+}
+
+void check_plan(const Options& o, const Session& session) {
+  const std::size_t held = cli::resident_bytes();
+  const std::size_t answers = session.planned_bytes(o.interactive ? 1 : o.questions.size());
+  cli::check_memory(held + answers, memory_limit(o),
+                    concat(cli::bytes_text(held), " with the encoders and autoencoders, ",
+                           cli::bytes_text(answers), " for the answers"),
+                    {});
+}
+
 int answer_all(const Options& o, Session& session, const cli::ThreadChoice& threads, Context& ctx,
                int argc, char** argv) {
   const cli::InterruptGuard interrupt;
@@ -193,8 +213,10 @@ int run(Options& o, int argc, char** argv) {
   Session session(o, ctx);
   if (o.dry_run) {
     print_plan(o, session);
+    check_plan(o, session);
     return 0;
   }
+  check_plan(o, session);
   if (!o.out.empty() && o.weights.empty()) open_folder(o);
   if (!o.interactive) return answer_all(o, session, threads, ctx, argc, argv);
   if (!o.out.empty()) {
@@ -202,7 +224,8 @@ int run(Options& o, int argc, char** argv) {
     record.status = "interactive";
     write_file(o.out + "/" + cli::kRunFile, run_json(record));
   }
-  return converse(session, o.out, ctx);
+  const std::size_t limit = memory_limit(o).bytes;
+  return converse(session, o.out, limit - std::min(limit, cli::resident_bytes()), ctx);
 }
 
 }  // namespace

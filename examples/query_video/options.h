@@ -27,6 +27,7 @@ struct Options {
   double min_score = lvggt::kNeutralRelevancy;
   std::int64_t every = 1;
   int threads = 0;
+  std::size_t memory_limit = 0;  // 0: what is free
   bool no_masks = false, no_heat = false, no_ply = false, no_sheet = false;
   bool interactive = false, force = false, json = false, dry_run = false;
 
@@ -151,6 +152,8 @@ inline void add_options(lvggt::cli::Program& program, Options& o) {
                             "Of the frame's scaled relevancy, above which a pixel is in the mask",
                             0, 1, "R");
   lvggt::cli::add_threads_option(program, o.threads);
+  program.add_bytes("--memory-limit", o.memory_limit,
+                    "Refuse to answer if more is needed; else what is free");
   add_lifting(program, o);
   app.footer(
       "Exit status: 0 done, 1 failed at run time, 2 wrong usage, 3 bad input, 4 memory or a "
