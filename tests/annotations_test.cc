@@ -75,7 +75,7 @@ TEST_CASE("annotations: the first polygon of an object counts, or all, and objec
   CHECK(count(label_mask(joined[0], "cup", PolygonRule::kFirst)) == 7);
 }
 
-TEST_CASE("annotations: crowd masks in runs, as numbers and as text") {
+TEST_CASE("B25 annotations: crowd masks in runs, as numbers and as text; wrong lengths refused") {
   // 8 x 10, down the columns: pixels 3 .. 5 and 16 .. 17.
   const auto images = read(coco(R"([{"id": 1, "image_id": 0, "category_id": 1, "iscrowd": 1,
     "segmentation": {"size": [8, 10], "counts": [3, 3, 10, 2, 62]}}])"));
@@ -96,7 +96,21 @@ TEST_CASE("annotations: crowd masks in runs, as numbers and as text") {
                 "the mask is 8 x 10 but the picture 000003_png.jpg is 10 x 8");
 }
 
-TEST_CASE("annotations: malformed ones are refused by place") {
+TEST_CASE("B25 annotations: a polygon of one or two points is its outline, a point or a line") {
+  const auto pixels = [](const std::string& polygon) {
+    const auto images = read(coco(R"([{"id": 1, "image_id": 0, "category_id": 1,
+        "segmentation": [)" + polygon +
+                                  "]}]"));
+    return count(label_mask(images.at(0), "cup", PolygonRule::kFirst));
+  };
+  CHECK(pixels("[1, 1, 4, 1]") == 4);
+  CHECK(pixels("[2, 1, 2, 6]") == 6);
+  CHECK(pixels("[2, 1, 2, 1]") == 1);
+  CHECK(pixels("[2, 1]") == 1);
+  CHECK(pixels("[-3, 1, 1, 1]") == 2);  // partly outside
+}
+
+TEST_CASE("B25 annotations: malformed ones are refused by place") {
   const auto object = [](const std::string& segmentation) {
     return coco(R"([{"id": 1, "image_id": 0, "category_id": 1, "segmentation": )" + segmentation +
                 "}]");
@@ -106,6 +120,9 @@ TEST_CASE("annotations: malformed ones are refused by place") {
   CHECK_REFUSED(read(object("[[]]")), "a polygon has 0 coordinates");
   CHECK_REFUSED(read(object("[]")), "there is no polygon");
   CHECK_REFUSED(read(object("[[20, 1, 30, 1, 30, 5]]")), "lies outside of the 10 x 8 picture");
+  CHECK_REFUSED(read(object("[[NaN, 1, 3, 1, 3, 5]]")), "a.json");
+  CHECK_REFUSED(read(object("[[1, 1e999, 3, 1, 3, 5]]")), "a.json");
+  CHECK_REFUSED(read(object("[[1, null, 3, 1, 3, 5]]")), "a.json");
   CHECK_REFUSED(read(object("[[1e300, 1, 3, 1, 3, 5]]")), "lies far outside");
   CHECK_REFUSED(read(coco(R"([{"id": 1, "image_id": 7, "category_id": 1, "segmentation": []}])")),
                 "the image_id 7 is no picture");
@@ -123,7 +140,7 @@ TEST_CASE("annotations: malformed ones are refused by place") {
                 "does not start with a frame number");
 }
 
-TEST_CASE("annotations: a listed picture that is not there is an error that names it") {
+TEST_CASE("B25 annotations: a listed picture that is not there is an error that names it") {
   const TempDir dir;
   write_bytes(dir / "a.json", coco());
   CHECK_REFUSED(read_coco_annotations(dir / "a.json", {}), "000003_png.jpg: there is no such");

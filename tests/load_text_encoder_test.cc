@@ -162,4 +162,6 @@ TEST_CASE("D06 text encoders: empty, blank, over-long and non-UTF-8 phrases") {
   CHECK(encode(std::string(4097, 'a')).kind == ErrorKind::kLimit);
   CHECK(encode("a \xc3 b").kind == ErrorKind::kFormat);
   CHECK(encode("😀 שלום").accepted);
+  CHECK(encode("<script>alert(1)</script>").accepted);
+  CHECK(encode(std::string(4096, 'a')).accepted);
 }

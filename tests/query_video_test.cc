@@ -159,7 +159,7 @@ TEST_CASE("query_video: nonsense is not found, unless something is to be found e
   CHECK(asked.ask({"unicorn", "--min-score", "0"}).prints("found in 6 of 6"));
 }
 
-TEST_CASE("query_video: a phrase that is empty, unknown to the list or not UTF-8 is refused") {
+TEST_CASE("D06 query_video: a phrase that is empty, too long, unknown or not UTF-8 is refused") {
   const Asked asked;
   const Result empty = asked.ask({"cup", ""});
   CHECK(empty.status == 2);
@@ -170,6 +170,14 @@ TEST_CASE("query_video: a phrase that is empty, unknown to the list or not UTF-8
   CHECK(unknown.says("a zebra"));
   CHECK(unknown.says("phrases"));
   CHECK(asked.ask({"\xff\xfe"}).status == 3);
+  CHECK(asked.ask({"   "}).status == 2);
+  CHECK(asked.ask({std::string(4096, 'a')}).status == 3);  // unknown, not too long
+  CHECK(asked.ask({std::string(4097, 'a')}).status == 4);
+  for (const char* odd : {"😀 a cup", "כוס", "<script>alert(1)</script>"}) {
+    const Result result = asked.ask({odd});
+    CHECK(result.status == 3);
+    CHECK(result.says(odd));
+  }
   CHECK(asked.ask({"--state", "the cup is tilted"}).says("--sentence-encoder"));
 }
 
