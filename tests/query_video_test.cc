@@ -327,6 +327,10 @@ TEST_CASE("query_video: asks a folder of pictures directly, which it lifts first
   CHECK(result.says("1 answer about 2 frames"));
   CHECK(fs::exists(asked / "out/001_cup/points/000001.ply"));
   CHECK(LiftedField::open(asked / "out/field").num_frames() == 2);
+  const Result refused = ask({"--out", asked / "out", "--force", "--memory-limit", "1M"});
+  CHECK(refused.status == 4);
+  CHECK(refused.says("but it may have 1.0 MiB (--memory-limit)"));
+  CHECK(fs::exists(asked / "out/001_cup/points/000001.ply"));  // nothing was replaced
   CHECK(ask({"--out", asked / "out", "--force"}).status == 0);
 }
 

@@ -33,7 +33,8 @@ LiftOptions lift_options_of(const Options& o, const std::string& folder) {
 
 }  // namespace
 
-void lift_first(const Options& o, const std::string& folder, Context& ctx) {
+void lift_first(const Options& o, const std::string& folder, const std::function<void()>& prepare,
+                Context& ctx) {
   LiftOptions lift = lift_options_of(o, folder);
   const lift_plan::ModelFiles files(lift.weights);
   lift.preprocess.size =
@@ -48,6 +49,7 @@ void lift_first(const Options& o, const std::string& folder, Context& ctx) {
 
   const LangVggt model = LangVggt::load(lift.weights, ctx);
   for (const std::string& warning : model.warnings()) say("warning: " + warning);
+  prepare();
   cli::create_output_folder(folder);
   RunFormat format = lift_plan::run_format(lift, input, files, ctx);
   format.has_rgb = false;

@@ -206,8 +206,8 @@ int run(Options& o, int argc, char** argv) {
   const cli::ThreadChoice threads = cli::choose_threads(o.threads);
   Context ctx(threads.threads);
   if (!o.weights.empty()) {
-    open_folder(o);
-    lift_first(o, o.out + "/" + kLiftedFolder, ctx);
+    lift_first(
+        o, o.out + "/" + kLiftedFolder, [&] { open_folder(o); }, ctx);
     o.field = o.out + "/" + kLiftedFolder;
   }
   Session session(o, ctx);
