@@ -161,7 +161,7 @@ DecoderTrainer::DecoderTrainer(ParameterStore& store, const TrainOptions& option
 
 LossTerms DecoderTrainer::run(const DecoderBatch& batch, const FrameShares& shares,
                               const DecoderOutputs& outputs, bool gradients,
-                              const TapGradients& dtaps, StepTimes& times) {
+                              const TapGradients<float>& dtaps, StepTimes& times) {
   const ModelConfig& config = store_.config();
   const bool batch_statistics = !options_.frozen_batch_norm;
   const auto weights =
@@ -171,8 +171,8 @@ LossTerms DecoderTrainer::run(const DecoderBatch& batch, const FrameShares& shar
   if (communicator_.size() > 1 && options_.synchronise_batch_norm) pass.ranks = &communicator_;
   pass.frozen_statistics = options_.frozen_batch_norm;
   pass.recompute = options_.activations == CheckpointActivations::kRecompute;
-  pass.bn_eps = static_cast<float>(config.bn_eps);
-  pass.bn_momentum = static_cast<float>(config.bn_momentum);
+  pass.bn_eps = config.bn_eps;
+  pass.bn_momentum = config.bn_momentum;
 
   std::ranges::copy(std::as_const(store_).block(StoreRole::kBuffers), running_.data());
   if (gradients) clear(store_.block(StoreRole::kGradients), ctx_);
@@ -186,21 +186,21 @@ LossTerms DecoderTrainer::run(const DecoderBatch& batch, const FrameShares& shar
         const std::span<float> bucket = store_.range(StoreRole::kGradients, prefix);
         if (!bucket.empty()) communicator_.start_sum(bucket);
       };
-    TapGradients dpart;
+    TapGradients<float> dpart;
     for (std::size_t i = 0; i < 4; ++i) dpart[i] = narrowed(dtaps[i]);
     FrameShares part_shares = shares;
     part_shares.labelled_pixels = shares.labelled_pixels.subspan(
         static_cast<std::size_t>(begin), static_cast<std::size_t>(end - begin));
     const DecoderBatch frames_of_part = frames_of(batch, begin, end);
-    const DecoderStep step{frames_of_part,
-                           weights,
-                           gradients ? &dweights : nullptr,
-                           {narrowed(outputs.language), narrowed(outputs.rgb)},
-                           objective_of(options_),
-                           part_shares,
-                           batch.h * config.patch_size,
-                           batch.w * config.patch_size,
-                           static_cast<float>(config.dpt_ln_eps)};
+    const DecoderStep<float> step{frames_of_part,
+                                  weights,
+                                  gradients ? &dweights : nullptr,
+                                  {narrowed(outputs.language), narrowed(outputs.rgb)},
+                                  objective_of(options_),
+                                  part_shares,
+                                  batch.h * config.patch_size,
+                                  batch.w * config.patch_size,
+                                  static_cast<float>(config.dpt_ln_eps)};
     decoder_step(dpart, terms, step, level_names_, pass);
   }
   times.forward += pass.forward_seconds;
@@ -214,7 +214,7 @@ LossTerms DecoderTrainer::run(const DecoderBatch& batch, const FrameShares& shar
 }
 
 LossTerms DecoderTrainer::evaluate(const DecoderBatch& batch, const DecoderOutputs& outputs,
-                                   bool gradients, const TapGradients& dtaps) {
+                                   bool gradients, const TapGradients<float>& dtaps) {
   check_batch(batch, store_.config());
   StepTimes times;
   const BatchCounts counts = count(batch, communicator_, ctx_);

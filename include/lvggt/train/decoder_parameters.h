@@ -84,15 +84,15 @@ struct DecoderParameters {
   std::optional<BranchParameters<T>> rgb;
 };
 
-template <class T>
-DoubleConvParameters<T> bind_double_conv(const ParameterBinder<T>& binder,
+template <class T, class Store>
+DoubleConvParameters<T> bind_double_conv(const ParameterBinder<T, Store>& binder,
                                          const std::string& prefix) {
   return {binder.normed_conv2d(prefix + ".0"), binder.normed_conv2d(prefix + ".3"),
           binder.batch_norm(prefix + ".1"), binder.batch_norm(prefix + ".4")};
 }
 
-template <class T>
-UNetEncoderParameters<T> bind_unet_encoder(const ParameterBinder<T>& binder,
+template <class T, class Store>
+UNetEncoderParameters<T> bind_unet_encoder(const ParameterBinder<T, Store>& binder,
                                            const std::string& prefix) {
   UNetEncoderParameters<T> encoder;
   for (std::size_t i = 0; i < 4; ++i) {
@@ -103,8 +103,8 @@ UNetEncoderParameters<T> bind_unet_encoder(const ParameterBinder<T>& binder,
   return encoder;
 }
 
-template <class T>
-PixelHeadParameters<T> bind_pixel_head(const ParameterBinder<T>& binder,
+template <class T, class Store>
+PixelHeadParameters<T> bind_pixel_head(const ParameterBinder<T, Store>& binder,
                                        const std::string& prefix) {
   if (binder.config().sbd_head == DecoderHead::kMlp)
     return MlpHeadParameters<T>{binder.pixel_linear(prefix + ".mlp.0"),
@@ -119,8 +119,8 @@ PixelHeadParameters<T> bind_pixel_head(const ParameterBinder<T>& binder,
   return decoder;
 }
 
-template <class T>
-BranchParameters<T> bind_branch(const ParameterBinder<T>& binder, const std::string& encoder,
+template <class T, class Store>
+BranchParameters<T> bind_branch(const ParameterBinder<T, Store>& binder, const std::string& encoder,
                                 const std::vector<std::string>& heads) {
   BranchParameters<T> branch;
   if (binder.config().sbd_head == DecoderHead::kUnet)
@@ -129,14 +129,14 @@ BranchParameters<T> bind_branch(const ParameterBinder<T>& binder, const std::str
   return branch;
 }
 
-template <class T>
-ResidualConvUnitParameters<T> bind_residual_conv_unit(const ParameterBinder<T>& binder,
+template <class T, class Store>
+ResidualConvUnitParameters<T> bind_residual_conv_unit(const ParameterBinder<T, Store>& binder,
                                                       const std::string& prefix) {
   return {binder.conv2d(prefix + ".conv1", 1, 1), binder.conv2d(prefix + ".conv2", 1, 1)};
 }
 
-template <class T>
-DptParameters<T> bind_dpt(const ParameterBinder<T>& binder, const std::string& prefix) {
+template <class T, class Store>
+DptParameters<T> bind_dpt(const ParameterBinder<T, Store>& binder, const std::string& prefix) {
   DptParameters<T> dpt;
   const std::string scratch = prefix + ".scratch";
   for (std::size_t i = 0; i < 4; ++i) {
@@ -159,8 +159,8 @@ DptParameters<T> bind_dpt(const ParameterBinder<T>& binder, const std::string& p
   return dpt;
 }
 
-template <class T>
-DecoderParameters<T> bind_decoder(const ParameterBinder<T>& binder) {
+template <class T, class Store>
+DecoderParameters<T> bind_decoder(const ParameterBinder<T, Store>& binder) {
   const ModelConfig& config = binder.config();
   DecoderParameters<T> decoder;
   if (config.sbd_dpt) {

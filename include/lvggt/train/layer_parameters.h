@@ -8,6 +8,10 @@
 
 namespace lvggt {
 
+// An input of a function template: T follows from the other arguments, so that a View<T, R> fits.
+template <class T, int R>
+using ConstView = std::type_identity_t<View<const T, R>>;
+
 // Parameters of the elementary layers as views into the store: with T = const float the weights,
 // with T = float their gradients, both under the same names.
 
@@ -39,27 +43,29 @@ struct NormParameters {
 // The running statistics belong to the weights: they are empty with the gradients.
 template <class T>
 struct BatchNormParameters {
-  View<T, 1> gamma, beta;                    // [C]
-  View<float, 1> running_mean, running_var;  // [C], moved by forward passes
+  View<T, 1> gamma, beta;                                     // [C]
+  View<std::remove_const_t<T>, 1> running_mean, running_var;  // [C], moved by forward passes
 };
 
-// Views into one block of a store, by the layers' published names without a final dot.
-template <class T>
+// Views into one block of a store, by the layers' published names without a final dot. Store has
+// config(), view() and block() as ParameterStore.
+template <class T, class Store = ParameterStore>
 class ParameterBinder {
  public:
+  using Scalar = std::remove_const_t<T>;
   static constexpr bool kGradients = !std::is_const_v<T>;
 
   // running: the running statistics that forward passes move, in the layout of the store's buffers;
   // not used for gradients. batch_statistics: batch norms take the batch's statistics, so that a
   // bias right before one cancels out and has no gradient.
-  ParameterBinder(ParameterStore& store, float* running, bool batch_statistics)
+  ParameterBinder(Store& store, Scalar* running, bool batch_statistics)
       : store_(store), running_(running), batch_statistics_(batch_statistics) {}
 
   const ModelConfig& config() const { return store_.config(); }
 
   template <int R>
   View<T, R> view(const std::string& name) const {
-    return store_.view<R>(kGradients ? StoreRole::kGradients : StoreRole::kWeights, name);
+    return store_.template view<R>(kGradients ? StoreRole::kGradients : StoreRole::kWeights, name);
   }
 
   NormParameters<T> norm(const std::string& prefix) const {
@@ -98,14 +104,14 @@ class ParameterBinder {
   }
 
  private:
-  View<float, 1> running(const std::string& name) const {
+  View<Scalar, 1> running(const std::string& name) const {
     if (kGradients) return {};
-    const View<float, 1> stored = store_.view<1>(StoreRole::kBuffers, name);
+    const View<Scalar, 1> stored = store_.template view<1>(StoreRole::kBuffers, name);
     return {running_ + (stored.data() - store_.block(StoreRole::kBuffers).data()), stored.shape()};
   }
 
-  ParameterStore& store_;
-  float* running_;
+  Store& store_;
+  Scalar* running_;
   bool batch_statistics_;
 };
 

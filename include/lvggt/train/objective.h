@@ -32,41 +32,41 @@ struct FrameShares {
 // Adds the language terms of one level to `terms`; levels: how many there are. dy (empty: not
 // wanted) receives the gradient of the weighted terms.
 //   dy, y, target: [B, H, W, d]   mask: [B, H, W]
-inline void language_loss(View<float, 4> dy, LossTerms& terms, View<const float, 4> y,
-                          View<const float, 4> target, View<const float, 3> mask,
-                          const FrameShares& shares, std::int64_t levels,
-                          const Objective& objective, Context& ctx) {
+template <class T>
+void language_loss(View<T, 4> dy, LossTerms& terms, ConstView<T, 4> y, ConstView<T, 4> target,
+                   ConstView<T, 3> mask, const FrameShares& shares, std::int64_t levels,
+                   const Objective& objective, Context& ctx) {
   const double share = shares.language / static_cast<double>(levels);
   Arena::Scope scope(ctx.arena());
   const Shape one{std::int64_t{1}, y.extent(1), y.extent(2), y.extent(3)};
-  const View<float, 4> dcos = dy ? ctx.arena().alloc(one) : View<float, 4>();
+  const View<T, 4> dcos = dy ? ctx.arena().alloc<T>(one) : View<T, 4>();
   for (std::int64_t b = 0; b < y.extent(0); ++b) {
     const auto frame = [b](auto view) { return view.narrow(0, b, b + 1); };
     if (shares.labelled_pixels[static_cast<std::size_t>(b)] == 0) {
-      if (dy) std::fill_n(frame(dy).data(), one.volume(), 0.0f);
+      if (dy) std::fill_n(frame(dy).data(), one.volume(), T{0});
       continue;
     }
-    const View<const float, 4> a = frame(y), t = frame(target);
-    const View<const float, 3> m = frame(mask);
+    const View<const T, 4> a = frame(y), t = frame(target);
+    const View<const T, 3> m = frame(mask);
     terms.l1 += share * l1_loss_forward(a, t, m, ctx);
     terms.cos += share * cosine_loss_forward(a, t, m, objective.axis, ctx);
     if (dy.empty()) continue;
     l1_loss_backward(frame(dy), share * objective.weights.l1, a, t, m, ctx);
     cosine_loss_backward(dcos, share * objective.weights.cos, a, t, m, objective.axis, ctx);
-    accumulate(batch_rows(frame(dy)), batch_rows(View<const float, 4>(dcos)), ctx);
+    accumulate(batch_rows(frame(dy)), batch_rows(ConstView<T, 4>(dcos)), ctx);
   }
 }
 
 // The same for the RGB terms.   dy, y, target: [B, H, W, 3]
-inline void rgb_loss(View<float, 4> dy, LossTerms& terms, View<const float, 4> y,
-                     View<const float, 4> target, const FrameShares& shares,
-                     const Objective& objective, Context& ctx) {
+template <class T>
+void rgb_loss(View<T, 4> dy, LossTerms& terms, ConstView<T, 4> y, ConstView<T, 4> target,
+              const FrameShares& shares, const Objective& objective, Context& ctx) {
   const double share = shares.rgb * static_cast<double>(y.extent(0));
   terms.img_l1 += share * l1_loss_forward(y, target, {}, ctx);
   terms.img_l2 += share * mse_loss_forward(y, target, {}, ctx);
   if (dy.empty()) return;
   Arena::Scope scope(ctx.arena());
-  const View<float, 4> dmse = ctx.arena().alloc(dy.shape());
+  const View<T, 4> dmse = ctx.arena().alloc<T>(dy.shape());
   l1_loss_backward(dy, share * objective.weights.img_l1, y, target, {}, ctx);
   mse_loss_backward(dmse, share * objective.weights.img_l2, y, target, {}, ctx);
   accumulate(batch_rows(dy), batch_rows(dmse), ctx);

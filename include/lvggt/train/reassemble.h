@@ -6,12 +6,13 @@
 
 namespace lvggt {
 
+template <class T>
 struct ReassembleActivations {
-  View<const float, 2> tokens;  // [B*h*w, 2C], the caller's
-  View<float, 1> mean, rstd;    // [B*h*w]
-  View<float, 2> normed;        // [B*h*w, 2C]
-  View<float, 4> projected;     // [B, h, w, out]
-  View<float, 4> resized;       // [B, H, W, out]; the projected map itself for tap 2
+  View<const T, 2> tokens;  // [B*h*w, 2C], the caller's
+  View<T, 1> mean, rstd;    // [B*h*w]
+  View<T, 2> normed;        // [B*h*w, 2C]
+  View<T, 4> projected;     // [B, h, w, out]
+  View<T, 4> resized;       // [B, H, W, out]; the projected map itself for tap 2
 };
 
 // Size of a tap's feature map: 4, 2, 1 and 1/2 times the patch grid.
@@ -30,54 +31,53 @@ Shape<4> reassembled_shape(const ReassembleParameters<T>& layer, const Shape<4>&
 
 // y = layer_rn(resize(project(norm(tokens)))).
 //   y: reassembled_shape   tokens: [B, h*w, 2C], patch tokens of one tap, dense
-inline void reassemble_forward(View<float, 4> y, ReassembleActivations& kept,
-                               View<const float, 3> tokens, std::int64_t h, std::int64_t w,
-                               const ReassembleParameters<const float>& layer, float eps,
-                               TrainingPass& pass) {
+template <class T>
+void reassemble_forward(View<T, 4> y, ReassembleActivations<T>& kept, ConstView<T, 3> tokens,
+                        std::int64_t h, std::int64_t w, const ReassembleParameters<const T>& layer,
+                        T eps, TrainingPass& pass) {
   Context& ctx = pass.ctx;
   Arena& arena = ctx.arena();
   const auto [B, N, C2] = tokens.shape();
   const std::int64_t channels = layer.project.weight.extent(0);
   kept.tokens = tokens.reshaped(Shape{B * N, C2});
-  kept.mean = arena.alloc(Shape{B * N});
-  kept.rstd = arena.alloc(Shape{B * N});
-  kept.normed = arena.alloc(Shape{B * N, C2});
+  kept.mean = arena.alloc<T>(Shape{B * N});
+  kept.rstd = arena.alloc<T>(Shape{B * N});
+  kept.normed = arena.alloc<T>(Shape{B * N, C2});
   layer_norm_forward(kept.normed, kept.mean, kept.rstd, kept.tokens, layer.norm.gamma,
                      layer.norm.beta, eps, ctx);
-  kept.resized = kept.projected = arena.alloc(Shape{B, h, w, channels});
+  kept.resized = kept.projected = arena.alloc<T>(Shape{B, h, w, channels});
   linear_forward(batch_rows(kept.projected), kept.normed, layer.project, Activation::kNone, ctx);
   const Shape resized{B, y.extent(1), y.extent(2), channels};
-  if (const auto* up = std::get_if<ConvTranspose2dParameters<const float>>(&layer.resize)) {
-    kept.resized = arena.alloc(resized);
+  if (const auto* up = std::get_if<ConvTranspose2dParameters<const T>>(&layer.resize)) {
+    kept.resized = arena.alloc<T>(resized);
     conv_transpose2d_forward(kept.resized, kept.projected, *up, ctx);
-  } else if (const auto* down = std::get_if<Conv2dParameters<const float>>(&layer.resize)) {
-    kept.resized = arena.alloc(resized);
+  } else if (const auto* down = std::get_if<Conv2dParameters<const T>>(&layer.resize)) {
+    kept.resized = arena.alloc<T>(resized);
     conv2d_forward(kept.resized, kept.projected, *down, Activation::kNone, {}, ctx);
   }
   conv2d_forward(y, kept.resized, layer.layer_rn, Activation::kNone, {}, ctx);
 }
 
 // dtokens: [B*h*w, 2C], may be empty
-inline void reassemble_backward(View<float, 2> dtokens, const ReassembleParameters<float>& gradient,
-                                View<const float, 4> dy, const ReassembleActivations& kept,
-                                const ReassembleParameters<const float>& layer,
-                                TrainingPass& pass) {
+template <class T>
+void reassemble_backward(View<T, 2> dtokens, const ReassembleParameters<T>& gradient,
+                         ConstView<T, 4> dy, const ReassembleActivations<T>& kept,
+                         const ReassembleParameters<const T>& layer, TrainingPass& pass) {
   Context& ctx = pass.ctx;
   Arena::Scope scope(ctx.arena());
-  const View<float, 4> dresized = ctx.arena().alloc(kept.resized.shape());
+  const View<T, 4> dresized = ctx.arena().alloc<T>(kept.resized.shape());
   conv2d_backward(dresized, gradient.layer_rn, dy, kept.resized, layer.layer_rn, ctx);
-  View<float, 4> dprojected = dresized;
-  if (const auto* up = std::get_if<ConvTranspose2dParameters<const float>>(&layer.resize)) {
-    dprojected = ctx.arena().alloc(kept.projected.shape());
-    conv_transpose2d_backward(dprojected,
-                              std::get<ConvTranspose2dParameters<float>>(gradient.resize), dresized,
-                              kept.projected, *up, ctx);
-  } else if (const auto* down = std::get_if<Conv2dParameters<const float>>(&layer.resize)) {
-    dprojected = ctx.arena().alloc(kept.projected.shape());
-    conv2d_backward(dprojected, std::get<Conv2dParameters<float>>(gradient.resize), dresized,
+  View<T, 4> dprojected = dresized;
+  if (const auto* up = std::get_if<ConvTranspose2dParameters<const T>>(&layer.resize)) {
+    dprojected = ctx.arena().alloc<T>(kept.projected.shape());
+    conv_transpose2d_backward(dprojected, std::get<ConvTranspose2dParameters<T>>(gradient.resize),
+                              dresized, kept.projected, *up, ctx);
+  } else if (const auto* down = std::get_if<Conv2dParameters<const T>>(&layer.resize)) {
+    dprojected = ctx.arena().alloc<T>(kept.projected.shape());
+    conv2d_backward(dprojected, std::get<Conv2dParameters<T>>(gradient.resize), dresized,
                     kept.projected, *down, ctx);
   }
-  const View<float, 2> dnormed = ctx.arena().alloc(kept.normed.shape());
+  const View<T, 2> dnormed = ctx.arena().alloc<T>(kept.normed.shape());
   linear_backward(dnormed, gradient.project, batch_rows(dprojected), kept.normed, layer.project,
                   ctx);
   layer_norm_backward(dtokens, gradient.norm.gamma, gradient.norm.beta, dnormed, kept.mean,

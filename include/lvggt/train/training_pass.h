@@ -18,8 +18,8 @@ struct TrainingPass {
   Communicator* ranks = nullptr;   // batch statistics over all ranks; null: this process alone
   bool frozen_statistics = false;  // batch norms use and keep the running statistics
   bool recompute = false;          // keep the stages' inputs only, compute the rest again
-  float bn_eps = 0;
-  float bn_momentum = 0;
+  double bn_eps = 0;
+  double bn_momentum = 0;
 
   // Called with the prefix of parameters whose gradients are complete, in the order of the backward
   // pass; may be empty.
