@@ -19,10 +19,9 @@ void check_clip(Comparison& comparison, const lvggt::LoadOptions& load, lvggt::B
 // ops: single operators and blocks, forward and backward.
 void check_ops(Comparison& comparison, lvggt::Context& ctx);
 
-// train, train_small, train_upstream_cos: losses, gradients and steps of the decoder. `inputs` is a
-// file that holds in.*, when the comparison's own does not. The tolerances are those that the
-// reference can be compared with: train_small is free of ReLU inputs close to zero, the others are
-// not.
+// train, train_small, train_upstream_cos: losses, gradients and steps of the decoder, twice: in
+// float64 like the reference, on plain kernels (lines "float64.*"), and by the float32 trainer.
+// `inputs` is a file that holds in.*, when the comparison's own does not.
 void check_train(Comparison& comparison, const std::string& name, const lvggt::LoadOptions& load,
                  const std::string& inputs, lvggt::Context& ctx);
 

@@ -132,7 +132,9 @@ int main(int argc, char** argv) {
       "Compares the engine with reference values: runs the case that CASE names in its "
       "metadata and prints one line a tensor, `name  max_abs_err  rel_err  ok|FAIL`, where "
       "rel_err = max|ours - ref| / max|ref|; for gradients and updates of the train cases it is "
-      "|ours - ref| / |ref| by Euclidean norms. Those cases have limits of their own.",
+      "|ours - ref| / |ref| by Euclidean norms. Those cases have limits of their own and are run "
+      "twice: in float64 as the reference was, lines \"float64.NAME\", and by the float32 trainer, "
+      "each step from where the float64 step started.",
       LVGGT_VERSION);
   auto& app = program.app();
   app.add_option("case", options.case_file,

@@ -111,21 +111,36 @@ void Comparison::compare_l2(const std::string& name, std::span<const float> valu
 }
 
 void Comparison::compare_steps(const std::string& name, std::span<const float> values,
-                               std::span<const double> tolerances) {
+                               double tolerance) {
   const std::vector<float> expected = take(name, values, false);
   if (expected.empty()) return;
+  Line line = step_errors(name, values, expected);
+  if (!(line.rel_err <= tolerance)) line.verdict = Verdict::kFail;
+  add(std::move(line));
+}
+
+void Comparison::show_steps(const std::string& name, const std::string& line_name,
+                            std::span<const float> values, const std::string& why) {
+  const lvggt::TensorEntry* entry = file_.find(name);
+  if (entry == nullptr || entry->size() != static_cast<std::int64_t>(values.size())) return;
+  std::vector<float> expected(values.size());
+  file_.read_into(name, expected);
+  Line line = step_errors(line_name, values, expected);
+  line.verdict = Verdict::kShown;
+  line.note = why;
+  add(std::move(line));
+}
+
+Comparison::Line Comparison::step_errors(const std::string& name, std::span<const float> values,
+                                         std::span<const float> expected) {
   Line line{name, 0, 0, 0, Verdict::kOk, {}, Measure::kMax};
   for (std::size_t i = 0; i < expected.size(); ++i) {
-    const double error = std::abs(static_cast<double>(values[i]) - expected[i]);
-    const double relative = error / std::abs(expected[i]);
+    const double difference = std::abs(static_cast<double>(values[i]) - expected[i]);
+    const double error = std::isnan(difference) ? kInfinity : difference;
     line.max_abs_err = std::max(line.max_abs_err, error);
-    line.rel_err = std::max(line.rel_err, relative);
-    if (relative <= tolerances[i]) continue;
-    line.verdict = Verdict::kFail;
-    line.note = "step " + std::to_string(i + 1) + " is beyond its limit";
+    line.rel_err = std::max(line.rel_err, error / std::abs(expected[i]));
   }
-  ok_ = ok_ && line.verdict == Verdict::kOk;
-  lines_.push_back(std::move(line));
+  return line;
 }
 
 void Comparison::compare_moved(const std::string& name, std::span<const float> values,
@@ -165,8 +180,7 @@ void Comparison::compare(const std::string& name, const std::vector<std::int64_t
   }
   if (line.max_abs_err != 0) line.rel_err = largest > 0 ? line.max_abs_err / largest : kInfinity;
   if (line.max_abs_err != 0) line.verdict = Verdict::kFail;  // whole numbers are exact
-  ok_ = ok_ && line.verdict == Verdict::kOk;
-  lines_.push_back(std::move(line));
+  add(std::move(line));
 }
 
 void Comparison::compare_masks(const std::string& name, const std::uint8_t* values,
@@ -190,8 +204,7 @@ void Comparison::compare_masks(const std::string& name, const std::uint8_t* valu
     line.verdict = Verdict::kFail;
     line.note = std::to_string(most) + " pixels of one mask differ";
   }
-  ok_ = ok_ && line.verdict == Verdict::kOk;
-  lines_.push_back(std::move(line));
+  add(std::move(line));
 }
 
 void Comparison::judge(const std::string& name, std::span<const float> ours,
@@ -214,28 +227,36 @@ void Comparison::judge(const std::string& name, std::span<const float> ours,
   line.measure = measure;
   const double error = measure == Measure::kL2 ? line.rel_l2 : line.rel_err;
   if (!(error <= tolerance)) line.verdict = Verdict::kFail;
-  ok_ = ok_ && line.verdict == Verdict::kOk;
+  add(std::move(line));
+}
+
+void Comparison::add(Line line) {
+  line.name = label_ + line.name;
+  ok_ = ok_ && line.verdict != Verdict::kFail && line.verdict != Verdict::kNotChecked;
   lines_.push_back(std::move(line));
 }
 
 void Comparison::add_failure(const std::string& name, const std::string& note) {
-  lines_.push_back({name, kInfinity, kInfinity, kInfinity, Verdict::kFail, note, Measure::kMax});
-  ok_ = false;
+  add({name, kInfinity, kInfinity, kInfinity, Verdict::kFail, note, Measure::kMax});
 }
 
 void Comparison::skip(const std::string& name, const std::string& why) {
   if (!wants(name) || !seen_.insert(name).second) return;
-  lines_.push_back({name, 0, 0, 0, Verdict::kSkipped, why, Measure::kMax});
+  add({name, 0, 0, 0, Verdict::kSkipped, why, Measure::kMax});
 }
 
 void Comparison::finish() {
   for (const lvggt::TensorEntry& entry : file_.entries()) {
     const std::string& name = entry.name;
     if (seen_.contains(name) || name.starts_with("weight.") || name.ends_with(".noise")) continue;
-    lines_.push_back(
-        {name, 0, 0, 0, Verdict::kNotChecked, "nothing was computed for it", Measure::kMax});
-    ok_ = false;
+    add({name, 0, 0, 0, Verdict::kNotChecked, "nothing was computed for it", Measure::kMax});
   }
+}
+
+void Comparison::begin_run(const std::string& label) {
+  if (!seen_.empty()) finish();
+  seen_.clear();
+  label_ = label;
 }
 
 std::string Comparison::text() const {
@@ -262,6 +283,9 @@ std::string Comparison::text() const {
       case Verdict::kSkipped:
         text += name + "  -  -  skipped  " + line.note + "\n";
         break;
+      case Verdict::kShown:
+        text += name + "  " + numbers + "  not judged  " + line.note + "\n";
+        break;
     }
   }
   return text;
@@ -284,7 +308,7 @@ std::string Comparison::json(const std::string& case_name) const {
   out.key("tensors");
   out.begin_array();
   for (const Line& line : lines_) {
-    if (line.verdict == Verdict::kSkipped) continue;
+    if (line.verdict == Verdict::kSkipped || line.verdict == Verdict::kShown) continue;
     out.begin_object();
     out.field("name", line.name);
     number("max_abs_err", line.verdict == Verdict::kNotChecked ? kInfinity : line.max_abs_err);
@@ -299,6 +323,18 @@ std::string Comparison::json(const std::string& case_name) const {
   out.begin_array();
   for (const Line& line : lines_)
     if (line.verdict == Verdict::kSkipped) out.value(line.name);
+  out.end_array();
+  out.key("not_judged");
+  out.begin_array();
+  for (const Line& line : lines_) {
+    if (line.verdict != Verdict::kShown) continue;
+    out.begin_object();
+    out.field("name", line.name);
+    number("max_abs_err", line.max_abs_err);
+    number("rel_err", line.rel_err);
+    out.field("note", line.note);
+    out.end_object();
+  }
   out.end_array();
   out.end_object();
   return out.take();

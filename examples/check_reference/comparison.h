@@ -43,9 +43,11 @@ class Comparison {
   // first elements only.
   void compare_l2(const std::string& name, std::span<const float> values, double tolerance);
 
-  // Numbers of a sequence of steps, each with a limit of its own for |ours - ref| / |ref|.
-  void compare_steps(const std::string& name, std::span<const float> values,
-                     std::span<const double> tolerances);
+  // Numbers of a sequence of steps, each by |ours - ref| / |ref| <= tolerance.
+  void compare_steps(const std::string& name, std::span<const float> values, double tolerance);
+  // The same under a name of its own, for information: it fails nothing.
+  void show_steps(const std::string& name, const std::string& line, std::span<const float> values,
+                  const std::string& why);
 
   // How far parameters have moved from `before`, |moved - moved ref| / |moved ref| by Euclidean
   // norms: each against `tolerance`; and, with end_moved(), all since the last end_moved()
@@ -59,15 +61,19 @@ class Comparison {
   // A tensor that is not computed, and why; it is listed, but fails nothing.
   void skip(const std::string& name, const std::string& why);
 
-  // Fails every tensor that nothing was computed for; call once, at the end.
+  // Fails every tensor that nothing was computed for; call once, at the end of a run.
   void finish();
+
+  // Everything once more, computed another way: `label` is put before the names of all lines from
+  // here on. An earlier run is finished first.
+  void begin_run(const std::string& label);
 
   bool ok() const { return ok_; }
   std::string text() const;
   std::string json(const std::string& case_name) const;
 
  private:
-  enum class Verdict { kOk, kFail, kNotChecked, kSkipped };
+  enum class Verdict { kOk, kFail, kNotChecked, kSkipped, kShown };
   enum class Measure { kMax, kL2 };
   struct Line {
     std::string name;
@@ -77,14 +83,18 @@ class Comparison {
     std::string note;  // why it failed, when the numbers do not say
     Measure measure = Measure::kMax;
   };
+  Line step_errors(const std::string& name, std::span<const float> values,
+                   std::span<const float> expected);
   void judge(const std::string& name, std::span<const float> ours, std::span<const float> expected,
              double tolerance, Measure measure = Measure::kMax);
   std::vector<float> take(const std::string& name, std::span<const float> ours, bool prefix);
   void add_failure(const std::string& name, const std::string& note);
+  void add(Line line);
 
   const lvggt::Safetensors& file_;
   double tolerance_;
   std::int64_t stride_ = 1;
+  std::string label_;
   std::set<std::string, std::less<>> seen_;
   std::vector<Line> lines_;
   bool ok_ = true;
