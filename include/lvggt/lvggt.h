@@ -48,6 +48,7 @@
 //   field/     coloured and language-featured clouds, colours of semantic maps, contact sheets
 //   kernels/   the operators the model is made of; not included here, like what follows
 //   train/     the Semantic Bridging Decoder's training; backward passes of encoder blocks
+//   exact/     the decoder's training in float64 on plain kernels, for checking
 //   data/      labelled scenes, token caches, loaders
 //   language/  text and image encoders (link lvggt::text), autoencoders, queries, scores
 //
