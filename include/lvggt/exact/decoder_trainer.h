@@ -17,13 +17,11 @@ namespace lvggt {
 // reference can be compared without the ReLU inputs that float32 puts on the other side of zero.
 class ExactDecoderTrainer {
  public:
-  // Parameters and context are borrowed. Options about parts of a batch, averages and judges are
-  // refused.
+  // Parameters and context are borrowed. A moving average or a judge of steps is refused.
   ExactDecoderTrainer(ExactParameters& parameters, const TrainOptions& options, Context& ctx)
       : parameters_(parameters), options_(options), ctx_(ctx) {
-    if (options.accumulate != 1 || options.ema_decay != 0 || options.judge)
-      fail(ErrorKind::kUsage, "exact training: batches in parts, a moving average and a judge are ",
-           "not supported");
+    if (options.ema_decay != 0 || options.judge)
+      fail(ErrorKind::kUsage, "exact training: there is neither a moving average nor a judge");
   }
 
   // As DecoderTrainer::evaluate(): the losses of a batch, its predictions and gradients.
@@ -44,20 +42,29 @@ class ExactDecoderTrainer {
     pass.bn_eps = config.bn_eps;
     pass.bn_momentum = config.bn_momentum;
     const std::vector<std::int64_t> labelled = labelled_pixels(batch.mask);
-    const auto frames = static_cast<double>(batch.num_frames());
-    const auto with_label =
-        frames - static_cast<double>(std::ranges::count(labelled, std::int64_t{0}));
-    const DecoderStep<double> step{batch,
-                                   weights,
-                                   gradients ? &dweights : nullptr,
-                                   outputs,
-                                   objective_of(options_),
-                                   {1 / frames, 1 / std::max(1.0, with_label), labelled},
-                                   batch.h * config.patch_size,
-                                   batch.w * config.patch_size,
-                                   config.dpt_ln_eps};
+    const std::int64_t B = batch.num_frames(), parts = std::min(options_.accumulate, B);
+    const auto with_label = static_cast<double>(B - std::ranges::count(labelled, std::int64_t{0}));
     LossTerms terms;
-    decoder_step(dtaps, terms, step, language_decoder_names(config), pass);
+    for (std::int64_t part = 0; part < parts; ++part) {
+      const std::int64_t begin = B * part / parts, end = B * (part + 1) / parts;
+      const auto narrowed = [&](auto view) { return view ? view.narrow(0, begin, end) : view; };
+      const BasicDecoderBatch<double> frames = frames_of(batch, begin, end);
+      const FrameShares shares{1 / static_cast<double>(B), 1 / std::max(1.0, with_label),
+                               std::span(labelled).subspan(static_cast<std::size_t>(begin),
+                                                           static_cast<std::size_t>(end - begin))};
+      const DecoderStep<double> step{frames,
+                                     weights,
+                                     gradients ? &dweights : nullptr,
+                                     {narrowed(outputs.language), narrowed(outputs.rgb)},
+                                     objective_of(options_),
+                                     shares,
+                                     batch.h * config.patch_size,
+                                     batch.w * config.patch_size,
+                                     config.dpt_ln_eps};
+      TapGradients<double> dpart;
+      for (std::size_t i = 0; i < 4; ++i) dpart[i] = narrowed(dtaps[i]);
+      decoder_step(dpart, terms, step, language_decoder_names(config), pass);
+    }
     add_up(terms, options_.loss);
     return terms;
   }
