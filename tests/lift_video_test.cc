@@ -24,9 +24,9 @@ TEST_CASE("lift_video: writes every output of every frame, under its final name 
   INFO(result.err);
   REQUIRE(result.status == 0);
   CHECK(result.says("3 frames in"));
-  std::vector<std::string> expected{"cameras.json",        "contact_sheet.png",
-                                    "field.json",          "sparse/0/cameras.txt",
-                                    "sparse/0/images.txt", "sparse/0/points3D.txt"};
+  std::vector<std::string> expected{
+      "cameras.json",         "cloud.png",           "contact_sheet.png",    "field.json",
+      "sparse/0/cameras.txt", "sparse/0/images.txt", "sparse/0/points3D.txt"};
   for (const char* frame : {"000000", "000001", "000002"}) {
     for (const char* folder : {"depth", "depth_color", "confidence", "rgb", "semantics_small",
                                "semantics_middle", "semantics_large", "images", "frames"})

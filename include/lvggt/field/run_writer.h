@@ -10,6 +10,7 @@
 #include <string>
 #include <vector>
 
+#include "lvggt/field/cloud_view.h"
 #include "lvggt/field/contact_sheet.h"
 #include "lvggt/field/frame_files.h"
 #include "lvggt/field/frame_pictures.h"
@@ -63,6 +64,7 @@ inline std::vector<std::string> run_files() {
   return {kFieldFile,
           "cameras.json",
           "contact_sheet.png",
+          "cloud.png",
           "sparse/0/cameras.txt",
           "sparse/0/images.txt",
           "sparse/0/points3D.txt",
@@ -93,6 +95,7 @@ inline std::vector<std::string> run_folders() {
 //   cameras.json                 every frame's camera
 //   sparse/0/*.txt               COLMAP text model
 //   contact_sheet.png            some frames side by side
+//   cloud.png                    the first frame's points from the left and from the right
 //   field.json                   what all these hold, for LiftedField
 // NNNNNN counts the frames of the run from 0. A file appears only when it is complete.
 class RunWriter {
@@ -290,6 +293,12 @@ class RunWriter {
       if (!write_file_of_frame("points/" + frame_stem(frame.record.index) + ".ply", stop,
                                [&](const std::string& file) { write_ply(file, points); }))
         return false;
+      if (frame.record.index == 0) {
+        constexpr std::int64_t kWidth = 480;
+        write_png(path("cloud.png"),
+                  render_cloud_from_both_sides(cloud_, frame.record.camera,
+                                               frame.maps.depth.shape(), kWidth));
+      }
     }
     if (colmap_) add_to_colmap(frame);
     return true;
