@@ -112,14 +112,17 @@ class Maker {
       scene_.primitives[i].group_from_local = in_hand * scene_.primitives[i].group_from_local;
     const std::size_t hand = scene_.primitives.size();
     const bool has_hand = random_.chance(0.9f);
-    if (has_hand)
-      objects_.add_hand(group, radius, 0.35f * random_.normal(), random_.uniform(-0.15f, 0.6f));
     // From the right as made; mirrored to the left, or from below.
     const float side = random_.chance(0.25f)  ? kPi / 2 + 0.4f * random_.normal()
                        : random_.chance(0.5f) ? 0.25f * random_.normal()
                                               : kPi + 0.25f * random_.normal();
     Mat3 turn = rotation({0, 0, 1}, side);
-    if (std::abs(side) > 2) turn = turn * rotation({1, 0, 0}, kPi);  // keeps the thing's up
+    const bool from_left = std::abs(side) > 2;
+    if (from_left) turn = turn * rotation({1, 0, 0}, kPi);  // keeps the thing's up
+    // Arms of somebody who stands beside or behind the thing.
+    const float away = random_.uniform(-0.15f, 0.6f);
+    if (has_hand)
+      objects_.add_hand(group, radius, 0.35f * random_.normal(), from_left ? -away : away);
     Group& held = scene_.groups[static_cast<std::size_t>(group)];
     held.world_from_group = {rotation({0, 1, 0}, view_turn) * turn, place};
     held.pivot = place;
@@ -148,11 +151,11 @@ class Maker {
     const float shake = random_.log_uniform(0.003f, 0.03f);
     path.shake = random_.direction() * (shake * distance);
     path.shake_turn = random_.direction() * (shake * random_.uniform(0.3f, 1.5f));
-    if (kind < 0.45f) return;  // held, but meant to stay
+    if (kind < 0.4f) return;  // held, but meant to stay
     // So much between two frames, however far apart they are.
     const float frames_per_second = 1 / scene_.seconds_per_frame;
     path.velocity =
-        random_.direction() * (distance * random_.log_uniform(0.01f, 0.16f) * frames_per_second);
+        random_.direction() * (distance * random_.log_uniform(0.03f, 0.25f) * frames_per_second);
     path.velocity.y *= 0.5f;
     path.turn = random_.direction() * (random_.log_uniform(0.006f, 0.12f) * frames_per_second);
     path.keep_target = random_.chance(0.5f) ? random_.uniform(0.3f, 1) : 0;

@@ -23,6 +23,8 @@ DEFAULTS = {
     "cam_qk_norm": False, "cam_ln_eps": 1e-5, "cam_adaln_eps": 1e-6, "cam_iterations": 4,
     "dpt_pos_embed_ratio": 0.1, "image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
 POSE_DISCOUNT = 0.6  # of an earlier iteration's error
+MOVING = 0.03        # of the mean distance: a translation that has a direction
+ERASED = 0.4         # of the patches of later frames, in every second clip
 CELLS = 4            # the training's helper predicts so many values along each side of a patch
 
 
@@ -69,18 +71,18 @@ def make_model(config, seed):
 
 
 class Helper(nn.Module):
-    """Only for training: reads depth, points in the first camera and the way back to the first frame
-    straight from the last layer's tokens, so that these learn before the dense head does."""
+    """Only for training: reads depth, points in the first camera, the way back to the first frame and
+    erased colours straight from the last layer's tokens, so that these learn before the dense head does."""
 
     def __init__(self, config):
         super().__init__()
-        self.read = nn.Linear(2 * config["embed_dim"], 6 * CELLS * CELLS)
+        self.read = nn.Linear(2 * config["embed_dim"], 9 * CELLS * CELLS)
 
     def forward(self, tokens, h, w):
-        x = self.read(tokens).view(-1, h, w, 6, CELLS, CELLS).permute(0, 3, 1, 4, 2, 5)
-        return x.reshape(-1, 6, h * CELLS, w * CELLS)
+        x = self.read(tokens).view(-1, h, w, 9, CELLS, CELLS).permute(0, 3, 1, 4, 2, 5)
+        return x.reshape(-1, 9, h * CELLS, w * CELLS)
 
-    def loss(self, tokens, batch):
+    def loss(self, tokens, batch, gone):
         B, S, H, W = batch["depth"].shape
         h, w = H // 14, W // 14
         out = self(tokens, h, w)
@@ -97,8 +99,21 @@ class Helper(nn.Module):
         here = torch.stack(torch.broadcast_tensors(u[None, :], v[:, None]), -1)
         back = pooled((where - here).clamp(-1.5, 1.5).permute(0, 1, 4, 2, 3))
         distance = points.norm(dim=1, keepdim=True).clamp(min=0.1)
+        # What is erased can only be seen in earlier frames: that teaches to look there.
+        unseen = gone.flatten(0, 1)[:, None].float().repeat_interleave(CELLS, 2).repeat_interleave(CELLS, 3)
+        colour = (out[:, 6:] - pooled(batch["images"])).abs().mean(1, keepdim=True)
         return ((out[:, :1] - log_depth).abs().mean() + ((out[:, 1:4] - points).abs() / distance).mean()
-                + 2 * (out[:, 4:] - back).abs().mean())
+                + 2 * (out[:, 4:6] - back).abs().mean() + 2 * (colour * unseen).sum() / unseen.sum().clamp(min=1))
+
+
+def erased(images):
+    """Images [B, S, 3, H, W] with patches of later frames in their mean colour, and which: [B, S, h, w]."""
+    B, S, _, H, W = images.shape
+    gone = torch.rand(B, S, H // 14, W // 14) < ERASED
+    gone[:, 0] = False
+    gone[torch.rand(B) < 0.5] = False
+    pixels = gone.repeat_interleave(14, 2).repeat_interleave(14, 3)[:, :, None]
+    return torch.where(pixels, images.mean((1, 3, 4), keepdim=True), images), gone
 
 
 def gradient_error(error):
@@ -108,6 +123,13 @@ def gradient_error(error):
         e = error[..., ::step, ::step]
         total = total + e.diff(dim=-1).abs().mean() + e.diff(dim=-2).abs().mean()
     return total / 3
+
+
+def direction_error(moved, wanted):
+    """One minus the cosine between translations [..., 3], mean over those that are long enough to have a direction."""
+    length = wanted.norm(dim=-1)
+    cosine = (moved * wanted).sum(-1) / (moved.norm(dim=-1).clamp(min=0.01) * length.clamp(min=1e-6))
+    return (1 - cosine)[length > MOVING].sum() / max(1, (length > MOVING).sum())
 
 
 def objective(out, batch):
@@ -122,8 +144,10 @@ def objective(out, batch):
     weight = POSE_DISCOUNT ** torch.arange(out["pose"].shape[2] - 1, -1, -1.0)
     off = ((out["pose"] - wanted).abs().mean((0, 1)) * weight[:, None]).sum(0) / weight.sum()
     shift, turn, view = off[:3].mean(), off[3:7].mean(), off[7:].mean()
-    loss = depth + 0.5 * gradient + 0.05 * confidence + 3 * shift + 6 * turn + view
-    return loss, {"depth": depth, "gradient": gradient, "confidence": confidence, "shift": shift, "turn": turn,
+    # L1 alone leaves the short translations of hand-held cameras unlearnt.
+    direction = direction_error(out["pose"][..., -1, :3], batch["pose"][..., :3])
+    loss = depth + 0.5 * gradient + 0.05 * confidence + 3 * shift + 6 * turn + view + 0.05 * direction
+    return loss, {"direction": direction, "depth": depth, "gradient": gradient, "confidence": confidence, "shift": shift, "turn": turn,
                   "view": view}
 
 

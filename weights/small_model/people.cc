@@ -44,7 +44,7 @@ void Objects::add_hand(int group, float radius, float arm_slope_y, float arm_slo
   const float wide = sleeve ? random_.uniform(1.5f, 2) : 1.35f;
   add_limb(group, middle, elbow, thin * (sleeve ? 1.45f : 1.25f), thin * wide, upper);
   const Vec3 on = normalized(
-      {1, arm_slope_y + random_.uniform(-0.5f, 0.5f), arm_slope_z + random_.uniform(-0.2f, 0.5f)});
+      {1, arm_slope_y + random_.uniform(-0.5f, 0.5f), arm_slope_z * random_.uniform(0.3f, 2)});
   add_limb(group, elbow, elbow + on * 0.35f, thin * wide, thin * wide * 1.3f, upper);
 }
 

@@ -5,7 +5,7 @@
   train.py RUN --stage 56x84:14x2,7x4:3000:7e-4 --stage 112x154:8x2,4x4:60m:3e-4
 
 A stage: the frames' size; the kinds of batches, taken in turns, clips x frames; how many steps, or minutes; the
-learning rate, which falls to a twentieth by half a cosine. Half of a batch's clips are new, half were new a few
+learning rate, which falls by half a cosine, to a half and in the last stage to a fiftieth. Half of a batch's clips are new, half were new a few
 steps before and come back mirrored and backwards. RUN gets checkpoint.pt (every few minutes, the weights' running
 average included), log.jsonl (losses and scores), arguments.json.
 """
@@ -24,9 +24,11 @@ import torch
 import evaluate
 import model as small
 import scenes
+from muon import Muon
 
 TRAIN_SEED = 10_000_000      # batch k of stage s: TRAIN_SEED * (s + 1) + 64 k
 HELD_OUT_SEED = 900_000_000  # never trained on
+MUON_RATE = 3                # its learning rate beside AdamW's
 AVERAGE = 0.998              # of the running average of the weights
 # Memory stays with the process and threads sleep while they wait: a step takes half the time.
 TUNED = {"OMP_WAIT_POLICY": "passive", "MALLOC_MMAP_MAX_": "0", "MALLOC_TRIM_THRESHOLD_": "20000000000"}
@@ -48,8 +50,9 @@ class Stage:
         """The part of the stage that k steps and so many seconds are."""
         return seconds / 60 / self.minutes if self.minutes else k / self.steps
 
-    def learning_rate(self, k, done, warm=100):
-        fall = 0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * min(done, 1)))
+    def learning_rate(self, k, done, last, warm=100):
+        end = 0.02 if last else 0.5
+        fall = end + (1 - end) * 0.5 * (1 + math.cos(math.pi * min(done, 1)))
         return self.rate * fall * min(1, (k + 1) / warm)
 
 
@@ -67,6 +70,13 @@ class Recent:
         return fresh + [scenes.mirrored(clip) for clip in old[:clips - len(fresh)]]
 
 
+def has_muon(name, parameter):
+    """Inner matrices of the blocks and the dense head. First and last layers, tokens, vectors and the camera head,
+    whose iterations share their weights, learn by AdamW."""
+    return (parameter.ndim > 1 and ("blocks." in name or name.startswith("depth_head."))
+            and not name.endswith("output_conv2.2.weight"))
+
+
 class Run:
     def __init__(self, args):
         self.folder = pathlib.Path(args.run)
@@ -77,9 +87,12 @@ class Run:
         self.helper = small.Helper(self.config)
         self.average = small.make_model(self.config, args.seed)
         self.dense = [*self.model.aggregator.parameters(), *self.model.depth_head.parameters()]
+        matrices = {name: p for name, p in self.model.named_parameters() if has_muon(name, p)}
+        self.muon = Muon(matrices)
         groups = {True: [], False: []}
-        for p in [*self.model.parameters(), *self.helper.parameters()]:
-            groups[p.ndim > 1].append(p)
+        for name, p in [*self.model.named_parameters(), *self.helper.named_parameters()]:
+            if name not in matrices:
+                groups[p.ndim > 1].append(p)
         self.optimiser = torch.optim.AdamW([{"params": groups[True], "weight_decay": 0.02},
                                             {"params": groups[False], "weight_decay": 0.0}],
                                            lr=0, betas=(0.9, 0.98), foreach=True)
@@ -104,7 +117,7 @@ class Run:
     def state(self):
         return {"model": self.model.state_dict(), "average": self.average.state_dict(),
                 "helper": self.helper.state_dict(), "optimiser": self.optimiser.state_dict(),
-                "stage": self.stage, "step": self.step, "total": self.total, "spent": self.spent}
+                "muon": self.muon.state_dict(), "stage": self.stage, "step": self.step, "total": self.total, "spent": self.spent}
 
     def save(self):
         path = self.folder / "checkpoint.pt"
@@ -113,7 +126,7 @@ class Run:
 
     def load(self):
         state = torch.load(self.folder / "checkpoint.pt")
-        for name in ("model", "average", "helper", "optimiser"):
+        for name in ("model", "average", "helper", "optimiser", "muon"):
             getattr(self, name).load_state_dict(state[name])
         self.stage, self.step, self.total, self.spent = (state[k] for k in ("stage", "step", "total", "spent"))
 
@@ -121,10 +134,13 @@ class Run:
         batch = {k: torch.from_numpy(v) for k, v in scenes.targets(clips).items() if v.dtype == "float32"}
         for group in self.optimiser.param_groups:
             group["lr"] = rate
-        out = self.model.clips(batch["images"], self.bf16)
+        self.muon.lr = MUON_RATE * rate
+        images, gone = small.erased(batch["images"])
+        out = self.model.clips(images, self.bf16)
         loss, terms = small.objective(out, batch)
-        terms["helper"] = self.helper.loss(out["taps"][-1], batch)
-        self.optimiser.zero_grad(set_to_none=True)
+        terms["helper"] = self.helper.loss(out["taps"][-1], batch, gone)
+        self.model.zero_grad(set_to_none=True)
+        self.helper.zero_grad(set_to_none=True)
         (loss + 0.5 * terms["helper"]).backward()
         # Apart, because the camera head's iterations make its gradients far larger.
         norm = torch.nn.utils.clip_grad_norm_(self.dense, 1.0)
@@ -132,6 +148,7 @@ class Run:
         if not math.isfinite(norm):
             raise RuntimeError(f"the gradient of step {self.total} is not finite")
         self.optimiser.step()
+        self.muon.step()
         self.total += 1
         decay = min(AVERAGE, self.total / (self.total + 20))
         with torch.no_grad():
@@ -149,7 +166,7 @@ class Run:
         fresh = scenes.Batches(generator, stage.plan, TRAIN_SEED * (self.stage + 1), self.step)
         recent, sums, begin, clock = Recent(len(stage.kinds)), {}, time.time(), time.time()
         while stage.done(self.step, self.spent) < 1 and not self.stop:
-            rate = stage.learning_rate(self.step, stage.done(self.step, self.spent))
+            rate = stage.learning_rate(self.step, stage.done(self.step, self.spent), stage is self.stages[-1])
             clips = recent.add_old(next(fresh), stage.kinds[self.step % len(stage.kinds)][0])
             for k, v in self.one_step(clips, rate).items():
                 sums.setdefault(k, []).append(v)
