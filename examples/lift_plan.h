@@ -242,11 +242,8 @@ inline std::vector<cli::MemoryChoice> storage_choices(const LiftOptions& options
 // Refuses the run when it needs more memory than it may have, and says which options would fit.
 inline void check_plan(const Plan& plan, const ModelFiles& files, const LiftOptions& options,
                        const Input& input) {
-  cli::MemoryLimit limit = cli::available_memory();
   // What this process holds already is part of the plan.
-  limit.bytes += std::min(cli::resident_bytes(), ~limit.bytes);
-  if (options.memory_limit > 0 && options.memory_limit < limit.bytes)
-    limit = {options.memory_limit, "--memory-limit"};
+  const cli::MemoryLimit limit = cli::memory_limit(options.memory_limit, cli::resident_bytes());
   const std::int64_t past = reachable_past_frames(options, input);
   const auto total = [&](const LiftOptions& changed, const ImageTransform& transform,
                          std::int64_t frames) {

@@ -109,9 +109,7 @@ inline std::string breakdown(const Plan& plan) {
 // Refuses the run when it needs more memory than it may have, and says which options would fit.
 inline void check_plan(const Plan& plan, const Checkpoint& checkpoint,
                        const MakeTokensOptions& options, const Input& input) {
-  cli::MemoryLimit limit = cli::available_memory();
-  if (options.memory_limit > 0 && options.memory_limit < limit.bytes)
-    limit = {options.memory_limit, "--memory-limit"};
+  const cli::MemoryLimit limit = cli::memory_limit(options.memory_limit);
   const std::int64_t past = reachable_past_frames(options, input);
   std::vector<cli::MemoryKnob> knobs;
   knobs.push_back({"--max-past-frames", 1, past, 1, [&](std::int64_t frames) {

@@ -120,7 +120,8 @@ void Comparison::compare_steps(const std::string& name, std::span<const float> v
 }
 
 void Comparison::show_steps(const std::string& name, const std::string& line_name,
-                            std::span<const float> values, const std::string& why) {
+                            std::span<const float> values, std::span<const double> limits,
+                            const std::string& why) {
   const lvggt::TensorEntry* entry = file_.find(name);
   if (entry == nullptr || entry->size() != static_cast<std::int64_t>(values.size())) return;
   std::vector<float> expected(values.size());
@@ -128,6 +129,13 @@ void Comparison::show_steps(const std::string& name, const std::string& line_nam
   Line line = step_errors(line_name, values, expected);
   line.verdict = Verdict::kShown;
   line.note = why;
+  for (std::size_t i = 0; i < std::min(limits.size(), values.size()); ++i) {
+    const Line step =
+        step_errors(line_name, values.subspan(i, 1), std::span(expected).subspan(i, 1));
+    if (step.rel_err <= limits[i]) continue;
+    line.verdict = Verdict::kFail;
+    line.note = lvggt::concat("step ", i + 1, " is off by ", step.rel_err, ", limit ", limits[i]);
+  }
   add(std::move(line));
 }
 

@@ -45,9 +45,10 @@ class Comparison {
 
   // Numbers of a sequence of steps, each by |ours - ref| / |ref| <= tolerance.
   void compare_steps(const std::string& name, std::span<const float> values, double tolerance);
-  // The same under a name of its own, for information: it fails nothing.
+  // The same under a name of its own, where only the first steps can be held to limits, one each;
+  // the later ones are for information, and `why` says why.
   void show_steps(const std::string& name, const std::string& line, std::span<const float> values,
-                  const std::string& why);
+                  std::span<const double> limits, const std::string& why);
 
   // How far parameters have moved from `before`, |moved - moved ref| / |moved ref| by Euclidean
   // norms: each against `tolerance`; and, with end_moved(), all since the last end_moved()

@@ -124,19 +124,10 @@ void print_plan(const Options& o, const Session& session) {
       cli::bytes_text(cli::resident_bytes() + session.planned_bytes(o.questions.size())).c_str());
 }
 
-// What it may have, counting what it holds already.
-cli::MemoryLimit memory_limit(const Options& o) {
-  cli::MemoryLimit limit = cli::available_memory();
-  limit.bytes += std::min(cli::resident_bytes(), ~limit.bytes);
-  if (o.memory_limit > 0 && o.memory_limit < limit.bytes)
-    limit = {o.memory_limit, "--memory-limit"};
-  return limit;
-}
-
 void check_plan(const Options& o, const Session& session) {
   const std::size_t held = cli::resident_bytes();
   const std::size_t answers = session.planned_bytes(o.interactive ? 1 : o.questions.size());
-  cli::check_memory(held + answers, memory_limit(o),
+  cli::check_memory(held + answers, cli::memory_limit(o.memory_limit, held),
                     concat(cli::bytes_text(held), " with the encoders and autoencoders, ",
                            cli::bytes_text(answers), " for the answers"),
                     {});
@@ -211,12 +202,9 @@ int run(Options& o, int argc, char** argv) {
     o.field = o.out + "/" + kLiftedFolder;
   }
   Session session(o, ctx);
-  if (o.dry_run) {
-    print_plan(o, session);
-    check_plan(o, session);
-    return 0;
-  }
+  if (o.dry_run) print_plan(o, session);
   check_plan(o, session);
+  if (o.dry_run) return 0;
   if (!o.out.empty() && o.weights.empty()) open_folder(o);
   if (!o.interactive) return answer_all(o, session, threads, ctx, argc, argv);
   if (!o.out.empty()) {
@@ -224,8 +212,9 @@ int run(Options& o, int argc, char** argv) {
     record.status = "interactive";
     write_file(o.out + "/" + cli::kRunFile, run_json(record));
   }
-  const std::size_t limit = memory_limit(o).bytes;
-  return converse(session, o.out, limit - std::min(limit, cli::resident_bytes()), ctx);
+  const std::size_t held = cli::resident_bytes();
+  const std::size_t limit = cli::memory_limit(o.memory_limit, held).bytes;
+  return converse(session, o.out, limit - std::min(limit, held), ctx);
 }
 
 }  // namespace

@@ -92,4 +92,13 @@ inline MemoryLimit available_memory() {
   return available;
 }
 
+// What a run may take: what is available, `held` bytes of which this process has already, but at
+// most the user's limit; 0: none.
+inline MemoryLimit memory_limit(std::size_t users_limit, std::size_t held = 0) {
+  MemoryLimit limit = available_memory();
+  limit.bytes += std::min(held, ~limit.bytes);
+  if (users_limit > 0 && users_limit < limit.bytes) limit = {users_limit, "--memory-limit"};
+  return limit;
+}
+
 }  // namespace lvggt::cli
