@@ -124,9 +124,9 @@ inline void add_inputs(lvggt::cli::Program& program, LiftOptions& o) {
   app.add_option("--list", o.list, "A file that names many of them, one a line; see below")
       ->type_name("FILE");
   app.add_option("--weights", o.weights.weights,
-                 "The geometry model: safetensors, or a sharded model's index or folder")
-      ->type_name("FILE")
-      ->required();
+                 "The geometry model: safetensors, or a sharded model's index or folder; without "
+                 "it, the small model that comes with lvggt")
+      ->type_name("FILE");
   app.add_option("--decoder", o.weights.decoder,
                  "The semantic bridging decoder, unless it is in the same file; without any, there "
                  "is geometry only")
@@ -263,6 +263,7 @@ inline void add_lift_options(lvggt::cli::Program& program, LiftOptions& options)
       "limit,\n"
       "5 partial result (the video ends early, or inputs of the list failed), 130 interrupted.\n\n"
       "Examples:\n"
+      "  lift_video clip.mp4 --out clip                   with the bundled small model, to try\n"
       "  lift_video clip.mp4 --weights model.safetensors --decoder decoder.safetensors --out clip\n"
       "  query_video clip \"the cup\" --text-encoder CLIP --autoencoder ae.safetensors --out "
       "answer\n"

@@ -8,6 +8,7 @@
 
 #include "examples/lift_options.h"
 #include "examples/lift_plan.h"
+#include "lvggt/cli/bundled_model.h"
 #include "lvggt/cli/interrupt.h"
 #include "lvggt/cli/output_folder.h"
 #include "lvggt/cli/progress.h"
@@ -331,6 +332,10 @@ int lift(LiftOptions& options, int argc, char** argv) {
   if (!options.summary.empty() && options.summary != "-") check_output_file(options.summary, true);
   // The output folder is looked at before the weights: it is the cheaper of the two.
   if (options.list.empty()) check_folder(options);
+  if (options.weights.weights.empty()) {
+    options.weights.weights = cli::find_bundled_file(kSmallModel);
+    say(cli::kSmallModelNotice);
+  }
   const cli::InterruptGuard interrupt;
   SharedModel shared(options);
   options.preprocess.size = options.size > 0

@@ -8,12 +8,18 @@
 //   #include <lvggt/lvggt.h>
 //
 //   #include <cstdio>
+//   #include <string>
 //
 //   int main(int argc, char** argv) try {
-//     if (argc < 3) lvggt::fail(lvggt::ErrorKind::kUsage, "give a video or folder, and weights");
+//     if (argc < 2) lvggt::fail(lvggt::ErrorKind::kUsage, "give a video or folder (and weights)");
+//     const std::string weights = argc > 2 ? argv[2] : SMALL_MODEL;  // from CMakeLists.txt
+//     if (argc == 2) {
+//       lvggt::check_bundled_file(lvggt::kSmallModel, weights);
+//       std::fprintf(stderr, "embed: no weights given: using the bundled small model\n");
+//     }
 //     lvggt::Context ctx;  // all CPUs this process may use
 //     const auto model =
-//         lvggt::LangVggt::load({.weights = argv[2], .decoder = argc > 3 ? argv[3] : ""}, ctx);
+//         lvggt::LangVggt::load({.weights = weights, .decoder = argc > 3 ? argv[3] : ""}, ctx);
 //     const lvggt::PreprocessOptions size{.size = static_cast<int>(model.config().img_size)};
 //
 //     lvggt::Stream stream(model, ctx, {.max_past_frames = 8});
@@ -88,5 +94,6 @@
 #include "lvggt/model/config.h"
 #include "lvggt/model/deterministic_weights.h"
 #include "lvggt/model/lang_vggt.h"
+#include "lvggt/model/small_model.h"
 #include "lvggt/model/stream.h"
 #include "lvggt/model/tensor_list.h"
