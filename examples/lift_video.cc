@@ -332,10 +332,7 @@ int lift(LiftOptions& options, int argc, char** argv) {
   if (!options.summary.empty() && options.summary != "-") check_output_file(options.summary, true);
   // The output folder is looked at before the weights: it is the cheaper of the two.
   if (options.list.empty()) check_folder(options);
-  if (options.weights.weights.empty()) {
-    options.weights.weights = cli::find_bundled_file(kSmallModel);
-    say(cli::kSmallModelNotice);
-  }
+  cli::default_to_small_model(options.weights.weights, say);
   const cli::InterruptGuard interrupt;
   SharedModel shared(options);
   options.preprocess.size = options.size > 0

@@ -8,6 +8,7 @@
 
 #include "examples/make_tokens_options.h"
 #include "examples/make_tokens_plan.h"
+#include "lvggt/cli/bundled_model.h"
 #include "lvggt/cli/interrupt.h"
 #include "lvggt/cli/output_folder.h"
 #include "lvggt/cli/progress.h"
@@ -305,6 +306,7 @@ int make_list(const MakeTokensOptions& options, Encoder& encoder,
 int run(MakeTokensOptions& options, int argc, char** argv) {
   options.settle();
   options.out = cli::without_trailing_slashes(options.out);
+  cli::default_to_small_model(options.weights.weights, say);
   const cli::InterruptGuard interrupt;
   Encoder encoder(options);
   options.preprocess.size =

@@ -76,10 +76,11 @@ inline void add_inputs(lvggt::cli::Program& program, MakeTokensOptions& o) {
                  "A labelled scene (rgb/2x or cam00/images), a folder of images, or a video");
   app.add_option("--list", o.list, "A file that names many of them, one a line; see below")
       ->type_name("FILE");
-  app.add_option("--weights", o.weights.weights,
-                 "The geometry model: safetensors, or a sharded model's index or folder")
-      ->type_name("FILE")
-      ->required();
+  app.add_option(
+         "--weights", o.weights.weights,
+         "The geometry model: safetensors, or a sharded model's index or folder; without it, "
+         "the small model that comes with lvggt")
+      ->type_name("FILE");
   app.add_option("--config", o.weights.config,
                  "The model's configuration; otherwise what the weights' metadata or shapes tell")
       ->type_name("JSON");

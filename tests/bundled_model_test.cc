@@ -14,6 +14,7 @@
 #include "lvggt/model/small_model.h"
 #include "tests/support/child_process.h"
 #include "tests/support/files.h"
+#include "tests/support/paths.h"
 #include "tests/support/temp_dir.h"
 
 using namespace lvggt;
@@ -25,7 +26,7 @@ namespace {
 constexpr const char* kShare = "../share/lvggt";
 
 std::string bundled_path() {
-  return (fs::path(LVGGT_LIFT_VIDEO).parent_path() / kShare / kSmallModel.name)
+  return (fs::path(test::program("lift_video")).parent_path() / kShare / kSmallModel.name)
       .lexically_normal()
       .string();
 }
@@ -42,7 +43,7 @@ class Installed {
     fs::create_directories(dir_ / "bin");
     fs::create_directories(dir_ / "share/lvggt");
     fs::create_directories(dir_ / "frames");
-    fs::copy_file(LVGGT_LIFT_VIDEO, dir_ / "bin/lift_video");
+    fs::copy_file(test::program("lift_video"), dir_ / "bin/lift_video");
     Tensor<std::uint8_t, 3> pixels(Shape{std::int64_t{60}, std::int64_t{80}, std::int64_t{3}});
     for (std::int64_t i = 0; i < pixels.size(); ++i)
       pixels.data()[i] = static_cast<std::uint8_t>(i % 251);

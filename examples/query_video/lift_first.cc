@@ -4,6 +4,7 @@
 #include <cstdio>
 
 #include "examples/lift_plan.h"
+#include "lvggt/cli/bundled_model.h"
 #include "lvggt/cli/interrupt.h"
 
 namespace query_video {
@@ -36,6 +37,7 @@ LiftOptions lift_options_of(const Options& o, const std::string& folder) {
 void lift_first(const Options& o, const std::string& folder, const std::function<void()>& prepare,
                 Context& ctx) {
   LiftOptions lift = lift_options_of(o, folder);
+  cli::default_to_small_model(lift.weights.weights, say);
   const lift_plan::ModelFiles files(lift.weights);
   lift.preprocess.size =
       lift.size > 0 ? lift.size : static_cast<int>(files.checkpoint().config().img_size);

@@ -17,7 +17,7 @@ namespace query_video {
 // The options of the program.
 struct Options {
   std::string field, out, phrase_file;
-  // The video is lifted first, when there are weights.
+  // The video is lifted first, when there are weights or decoders.
   std::string weights, decoder, state_decoder, config;
   int size = 0;
   std::int64_t max_past_frames = 128;
@@ -31,6 +31,7 @@ struct Options {
   bool no_masks = false, no_heat = false, no_ply = false, no_sheet = false;
   bool interactive = false, force = false, json = false, dry_run = false;
 
+  bool lifts() const { return !(weights.empty() && decoder.empty() && state_decoder.empty()); }
   bool asks_states() const {
     return interactive ? !sentence_encoder.empty() : !questions.states.empty();
   }
@@ -50,11 +51,12 @@ struct Options {
       fail(ErrorKind::kUsage, "--state needs --sentence-encoder and --state-autoencoder");
     if (sentence_encoder.empty() != state_autoencoder.empty())
       fail(ErrorKind::kUsage, "--sentence-encoder and --state-autoencoder go together");
-    if (weights.empty() && !(decoder.empty() && state_decoder.empty() && config.empty()))
-      fail(ErrorKind::kUsage, "--decoder, --state-decoder and --config need --weights");
-    if (!weights.empty() && (out.empty() || dry_run))
+    if (!config.empty() && weights.empty())
+      fail(ErrorKind::kUsage, "--config is for --weights: the bundled small model has its own");
+    if (lifts() && (out.empty() || dry_run))
       fail(ErrorKind::kUsage,
-           "--weights needs --out, where the lifted field goes, and no --dry-run");
+           weights.empty() ? "--decoder and --state-decoder need" : "--weights needs",
+           " --out, where the lifted field goes, and no --dry-run");
     if (out.empty() && force) fail(ErrorKind::kUsage, "--force is for --out");
   }
 
@@ -78,7 +80,10 @@ inline void add_lifting(lvggt::cli::Program& program, Options& o) {
   const auto add_file = [&](const std::string& name, std::string& file, const std::string& text) {
     app.add_option(name, file, text)->type_name("FILE")->group(group);
   };
-  add_file("--weights", o.weights, "Lift FIELD with this geometry model into OUT/field, then ask");
+  add_file(
+      "--weights", o.weights,
+      "Lift FIELD with this geometry model into OUT/field, then ask; with a decoder only, with "
+      "the small model that comes with lvggt");
   add_file("--decoder", o.decoder, "The semantic bridging decoder, unless it is in the same file");
   add_file("--state-decoder", o.state_decoder, "The decoder of states");
   add_file("--config", o.config, "The model's configuration, unless the weights tell");
@@ -95,8 +100,10 @@ inline void add_lifting(lvggt::cli::Program& program, Options& o) {
 
 inline void add_options(lvggt::cli::Program& program, Options& o) {
   CLI::App& app = program.app();
-  app.add_option("FIELD", o.field,
-                 "The folder that lift_video wrote; with --weights, a video or a folder of images")
+  app.add_option(
+         "FIELD", o.field,
+         "The folder that lift_video wrote; with --weights or a decoder, a video or a folder of "
+         "images")
       ->required();
   app.add_option("PHRASE", o.questions.phrases,
                  "What to look for, \"the cup\"; any number of them");

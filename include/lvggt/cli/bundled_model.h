@@ -33,4 +33,12 @@ inline std::string find_bundled_file(const BundledFile& file) {
   return path;
 }
 
+// `weights` becomes the small model's path if it is empty, and say(line) hears of it.
+template <class Say>
+void default_to_small_model(std::string& weights, const Say& say) {
+  if (!weights.empty()) return;
+  weights = find_bundled_file(kSmallModel);
+  say(kSmallModelNotice);
+}
+
 }  // namespace lvggt::cli
