@@ -113,18 +113,15 @@ inline RunFormat run_format(const LiftOptions& options, const Input& input, cons
 // and of the contact sheet, and the decoding of the original.
 inline std::size_t program_bytes(const ImageTransform& transform, std::size_t frames,
                                  const DecoderSizes& decoders) {
-  constexpr std::size_t kCode = std::size_t{20} << 20;
+  constexpr std::size_t kCode = std::size_t{18} << 20;
   const auto width = static_cast<std::size_t>(transform.width);
   const auto height = static_cast<std::size_t>(transform.height);
   const std::size_t pixels = width * height;
   const auto original = static_cast<std::size_t>(transform.original_width) *
                         static_cast<std::size_t>(transform.original_height);
-  // Vectors of the points, a picture of each map, and the codes of one decoder on their way to
-  // disk.
-  const std::int64_t on_disk =
-      std::max(decoders.levels * decoders.dim, decoders.state_levels * decoders.state_dim);
-  const auto semantics = static_cast<std::size_t>(4 * decoders.levels * decoders.dim +
-                                                  3 * decoders.maps() + 4 * on_disk);
+  // Vectors of the points and a picture of each map; codes go to disk as they are.
+  const auto semantics =
+      static_cast<std::size_t>(4 * decoders.levels * decoders.dim + 3 * decoders.maps());
   // The contact sheet keeps up to 16 frames, each with four pictures and the levels.
   constexpr std::size_t kSheetFrames = 16, kSheetCellWidth = 176;
   const std::size_t cell_width = std::min<std::size_t>(width, kSheetCellWidth);
