@@ -103,7 +103,7 @@ TEST_CASE("cloud view: an empty cloud and points that are no numbers leave the b
   const PointCloud none(kHeight, kWidth, 0, 0);
   const Tensor<std::uint8_t, 3> empty =
       render_cloud(none, scene.camera, scene.depth.shape(), 10, {});
-  CHECK(*std::max_element(empty.data(), empty.data() + empty.size()) == 24);
+  CHECK(*std::max_element(empty.data(), empty.data() + empty.size()) == 96);
 
   std::fill_n(scene.depth.data(), scene.depth.size(), 1e30f);  // their squares overflow
   scene.cloud.build({scene.depth, scene.confidence, scene.colors, {}, scene.camera}, 0, scene.ctx);

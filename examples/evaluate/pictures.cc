@@ -5,6 +5,7 @@
 #include <array>
 
 #include "lvggt/field/line_plot.h"
+#include "lvggt/field/time_line.h"
 #include "lvggt/io/image.h"
 #include "lvggt/io/png.h"
 
@@ -67,23 +68,22 @@ void MaskSheet::write(const std::string& path) const {
 }
 
 void write_time_lines(const std::string& path, const SceneResult& scene) {
-  constexpr Rgb8 kBlue{31, 119, 180}, kBlack{30, 30, 30}, kGreen{30, 140, 60};
+  constexpr Rgb8 kBlue{31, 119, 180}, kRed{200, 60, 40}, kShade{214, 234, 214};
   std::vector<PlotPanel> panels;
   for (const StateResult& state : scene.states) {
     if (state.frames.empty()) continue;
-    const auto [low, high] = std::ranges::minmax(state.answer.similarity);
-    std::vector<std::array<double, 2>> raw, smoothed, annotated;
-    for (std::size_t i = 0; i < state.frames.size(); ++i) {
-      const auto frame = static_cast<double>(state.frames[i]);
-      raw.push_back({frame, state.answer.similarity[i]});
-      smoothed.push_back({frame, state.answer.smoothed[i]});
-      annotated.push_back({frame, state.truth[i] != 0 ? high : low});
-    }
-    const double first = raw.front()[0], last = raw.back()[0], mean = state.answer.threshold;
+    std::vector<double> frames(state.frames.begin(), state.frames.end());
+    std::vector<std::array<double, 2>> smoothed;
+    for (std::size_t i = 0; i < frames.size(); ++i)
+      smoothed.push_back({frames[i], state.answer.smoothed[i]});
+    const double mean = state.answer.threshold;
     PlotPanel panel{"\"" + state.wording + "\": similarity", "frame", {}, false};
-    panel.curves.push_back({"annotated (high: it holds)", kGreen, annotated, true});
+    panel.bands = positive_bands(frames, state.truth);
+    panel.band_color = kShade;
+    panel.curves.push_back({"annotated: it holds", kShade, {}, false});
     panel.curves.push_back({"smoothed", kBlue, smoothed, false});
-    panel.curves.push_back({"threshold", kBlack, {{first, mean}, {last, mean}}, true});
+    panel.curves.push_back(
+        {"threshold", kRed, {{frames.front(), mean}, {frames.back(), mean}}, false});
     panels.push_back(std::move(panel));
   }
   if (panels.empty()) return;

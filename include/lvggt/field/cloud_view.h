@@ -65,7 +65,7 @@ struct Canvas {
 inline Tensor<std::uint8_t, 3> render_cloud(const PointCloud& cloud, const Camera& camera,
                                             const Shape<2>& frame, std::int64_t width,
                                             const CloudViewpoint& from) {
-  constexpr std::uint8_t kBackground = 24;
+  constexpr std::uint8_t kBackground = 96;  // neither dark nor bright things vanish before it
   constexpr float kOverlap = 0.6f;  // of a pixel's side: neighbours touch when turned away
   const float scale = static_cast<float>(width) / static_cast<float>(frame[1]);
   const auto height = std::max<std::int64_t>(
