@@ -61,6 +61,8 @@ class Rope2d:
 
 
 class Attention(nn.Module):
+    kept = None  # a list for a training that wants to see queries and keys
+
     def __init__(self, dim, heads, qk_norm):
         super().__init__()
         self.heads = heads
@@ -77,6 +79,8 @@ class Attention(nn.Module):
         q, k = self.q_norm(q), self.k_norm(k)
         if rope is not None:
             q, k = rope(q), rope(k)
+        if self.kept is not None:
+            self.kept.append((q, k))
         if cache is not None:
             cache.append((k, v))
             k, v = (torch.cat(parts, 2) for parts in zip(*cache))

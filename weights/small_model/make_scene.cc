@@ -23,7 +23,7 @@ class Maker {
   explicit Maker(std::uint64_t seed) : random_(seed), objects_(scene_, random_) {}
 
   Scene make() {
-    scene_.fov_w = random_.uniform(0.7f, 1.5f);
+    scene_.fov_w = random_.uniform(0.8f, 1.3f);
     const float kind = random_.uniform();
     if (kind < 0.36f)
       make_held();
@@ -119,8 +119,8 @@ class Maker {
     Mat3 turn = rotation({0, 0, 1}, side);
     const bool from_left = std::abs(side) > 2;
     if (from_left) turn = turn * rotation({1, 0, 0}, kPi);  // keeps the thing's up
-    // Arms of somebody who stands beside or behind the thing.
-    const float away = random_.uniform(-0.15f, 0.6f);
+    // Somebody who stands beside or behind the thing holds it out, so that it can be seen.
+    const float away = random_.uniform(0.15f, 0.95f);
     if (has_hand)
       objects_.add_hand(group, radius, 0.35f * random_.normal(), from_left ? -away : away);
     Group& held = scene_.groups[static_cast<std::size_t>(group)];
@@ -139,30 +139,30 @@ class Maker {
     CameraPath& path = scene_.camera;
     path.position = eye;
     path.target = target;
-    path.cam_from_world = look_at(
-        eye, target, random_.chance(0.7f) ? 0.06f * random_.normal() : 0.25f * random_.normal());
+    path.cam_from_world =
+        look_at(eye, target, (random_.chance(0.85f) ? 0.05f : 0.15f) * random_.normal());
     for (int k = 0; k < 3; ++k) {
       path.rate[k] = random_.uniform(1, 8);
       path.phase[k] = random_.uniform(0, 2 * kPi);
     }
     scene_.seconds_per_frame = random_.log_uniform(0.04f, 0.5f);
     const float kind = random_.uniform();
-    if (kind < 0.22f) return;  // on a tripod
+    if (kind < 0.15f) return;  // on a tripod
     const float shake = random_.log_uniform(0.003f, 0.03f);
     path.shake = random_.direction() * (shake * distance);
     path.shake_turn = random_.direction() * (shake * random_.uniform(0.3f, 1.5f));
-    if (kind < 0.4f) return;  // held, but meant to stay
+    if (kind < 0.3f) return;  // held, but meant to stay
     // So much between two frames, however far apart they are.
     const float frames_per_second = 1 / scene_.seconds_per_frame;
     path.velocity =
-        random_.direction() * (distance * random_.log_uniform(0.03f, 0.25f) * frames_per_second);
+        random_.direction() * (distance * random_.log_uniform(0.04f, 0.2f) * frames_per_second);
     path.velocity.y *= 0.5f;
-    path.turn = random_.direction() * (random_.log_uniform(0.006f, 0.12f) * frames_per_second);
+    path.turn = random_.direction() * (random_.log_uniform(0.006f, 0.08f) * frames_per_second);
     path.keep_target = random_.chance(0.5f) ? random_.uniform(0.3f, 1) : 0;
   }
 
   void make_held() {
-    const float wall = random_.log_uniform(0.55f, 3);
+    const float wall = random_.log_uniform(0.6f, 2);
     const float floor = random_.uniform(0.7f, 1.6f);
     set_room({-random_.uniform(1, 4), -random_.uniform(0.9f, 1.8f), -random_.uniform(1.5f, 4)},
              {random_.uniform(1, 4), floor, wall});
@@ -170,7 +170,7 @@ class Maker {
     const float yaw = (random_.chance(0.75f) ? 0.2f : 0.5f) * random_.normal();
     const float pitch = 0.13f * random_.normal();
     const Vec3 view = normalized({std::sin(yaw), std::sin(pitch), std::cos(yaw)});
-    const float reach = std::min(wall * random_.uniform(0.35f, 0.85f), 0.9f);
+    const float reach = std::min(wall * random_.uniform(0.4f, 0.8f), 0.9f);
     const float size = reach * random_.log_uniform(0.12f, 0.32f);  // half height
     if (random_.chance(0.92f)) {
       const Vec3 off{0.25f * reach * random_.normal(), 0.16f * reach * random_.normal(), 0};
@@ -223,7 +223,7 @@ class Maker {
     eye.x = std::clamp(eye.x, scene_.room_low.x + 0.1f, scene_.room_high.x - 0.1f);
     const Vec3 target{0.15f * random_.normal(), random_.uniform(-0.15f, 0.05f),
                       random_.uniform(-0.1f, 0.3f)};
-    if (random_.chance(0.3f)) {
+    if (random_.chance(0.2f)) {
       const Vec3 place =
           mix(eye, target, random_.uniform(0.5f, 0.9f)) + Vec3{0.1f * random_.normal(), -0.1f, 0};
       hold(place, random_.uniform(0.04f, 0.12f), -around);
@@ -245,6 +245,8 @@ class Maker {
         else
           at.x = wall == 1 ? low.x + half.x : high.x - half.x;
       }
+      // Nobody stands in a cupboard to film.
+      if (at.z - half.z < 0.8f && std::abs(at.x) - half.x < 0.8f) at.z = 0.8f + 2 * half.z;
       const float turn = random_.chance(0.6f) ? 0.5f * kPi * static_cast<float>(random_.below(4))
                                               : random_.uniform(0, 2 * kPi);
       const int group = objects_.add_group(Label::kThing, upright(at, turn));
@@ -253,7 +255,7 @@ class Maker {
   }
 
   void make_room() {
-    const float width = random_.uniform(2.4f, 7), deep = random_.uniform(2.5f, 8);
+    const float width = random_.uniform(2.4f, 6), deep = random_.uniform(2.5f, 6);
     const float high = random_.uniform(2.3f, 3.3f), eye = random_.uniform(0.9f, 1.75f);
     set_room({-width * random_.uniform(0.3f, 0.7f), eye - high, -1.5f}, {0, eye, deep});
     scene_.room_high.x = scene_.room_low.x + width;
@@ -265,23 +267,24 @@ class Maker {
                 random_.chance(0.6f) ? 0.5f * random_.normal() : random_.uniform(0, 2 * kPi));
     const float yaw = 0.5f * random_.normal(), pitch = 0.08f + 0.18f * random_.normal();
     const Vec3 view = normalized({std::sin(yaw), std::tan(pitch), std::cos(yaw)});
-    if (random_.chance(0.25f))
-      hold(view * random_.uniform(0.35f, 0.8f) + Vec3{0, 0.05f, 0}, 0.09f, yaw);
+    if (random_.chance(0.08f))
+      hold(view * random_.uniform(0.45f, 0.9f) + Vec3{0, 0.05f, 0}, 0.09f, yaw);
     aim({0, 0, 0}, view * (0.6f * deep), 0.6f * deep);
   }
 
   void make_person() {
-    const float wall = random_.log_uniform(0.9f, 5), eye = random_.uniform(1.1f, 1.7f);
+    const float wall = random_.log_uniform(1.2f, 5), eye = random_.uniform(1.1f, 1.7f);
     set_room({-random_.uniform(1, 4), eye - random_.uniform(2.3f, 3), -2},
              {random_.uniform(1, 4), eye, wall});
     for (const int face : {0, 1, 5})
       if (random_.chance(0.5f)) decorate(face, 1 + random_.below(4));
     furnish(random_.below(5));
-    const float distance = std::min(random_.log_uniform(0.5f, 2.2f), wall - 0.15f);
+    const float distance = std::min(random_.log_uniform(0.75f, 2.4f), wall - 0.15f);
     person_at({0.15f * distance * random_.normal(), eye, distance}, 0.35f * random_.normal());
     if (random_.chance(0.3f))
       hold({0.2f * random_.normal(), 0.1f, distance * random_.uniform(0.5f, 0.8f)}, 0.09f, 0);
-    const Vec3 target{0.1f * random_.normal(), random_.uniform(-0.2f, 0.4f) * distance, distance};
+    // At the shoulders or the face: people are filmed with their heads.
+    const Vec3 target{0.1f * random_.normal(), eye - 1.45f + 0.12f * random_.normal(), distance};
     aim({0, 0, 0}, target, distance);
   }
 
@@ -311,12 +314,12 @@ class Maker {
 
   void choose_look() {
     Look& look = scene_.look;
-    look.brightness = random_.uniform(0.25f, 0.68f);
+    look.brightness = random_.uniform(0.3f, 0.68f);
     look.gamma = random_.uniform(1.7f, 2.4f);
     look.contrast = random_.uniform(0.8f, 1.2f);
     look.vignette = random_.chance(0.5f) ? random_.uniform(0, 0.5f) : 0;
-    look.blur = random_.chance(0.6f) ? random_.uniform(0, 0.7f) : 0;
-    look.noise = random_.chance(0.7f) ? random_.log_uniform(0.002f, 0.03f) : 0;
+    look.blur = random_.chance(0.6f) ? random_.uniform(0, 0.5f) : 0;
+    look.noise = random_.chance(0.7f) ? random_.log_uniform(0.002f, 0.02f) : 0;
     for (int k = 0; k < 3; ++k) look.tint[k] = random_.uniform(0.85f, 1.15f);
   }
 

@@ -24,8 +24,6 @@ DEFAULTS = {
     "dpt_pos_embed_ratio": 0.1, "image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
 POSE_DISCOUNT = 0.6  # of an earlier iteration's error
 MOVING = 0.03        # of the mean distance: a translation that has a direction
-ERASED = 0.4         # of the patches of later frames, in every second clip
-CELLS = 4            # the training's helper predicts so many values along each side of a patch
 
 
 def load_config(path=HERE / "config.json"):
@@ -70,52 +68,6 @@ def make_model(config, seed):
     return model
 
 
-class Helper(nn.Module):
-    """Only for training: reads depth, points in the first camera, the way back to the first frame and
-    erased colours straight from the last layer's tokens, so that these learn before the dense head does."""
-
-    def __init__(self, config):
-        super().__init__()
-        self.read = nn.Linear(2 * config["embed_dim"], 9 * CELLS * CELLS)
-
-    def forward(self, tokens, h, w):
-        x = self.read(tokens).view(-1, h, w, 9, CELLS, CELLS).permute(0, 3, 1, 4, 2, 5)
-        return x.reshape(-1, 9, h * CELLS, w * CELLS)
-
-    def loss(self, tokens, batch, gone):
-        B, S, H, W = batch["depth"].shape
-        h, w = H // 14, W // 14
-        out = self(tokens, h, w)
-
-        def pooled(x):
-            return F.adaptive_avg_pool2d(x.flatten(0, 1), (h * CELLS, w * CELLS))
-
-        log_depth = pooled(batch["depth"].log()[:, :, None])
-        points = pooled(batch["points"].permute(0, 1, 4, 2, 3))
-        tangent = (batch["pose"][:, :, None, None, 7:9] / 2).tan().flip(-1)  # width, height
-        where = batch["points"][..., :2] / batch["points"][..., 2:].clamp(min=0.05) / tangent
-        u = (torch.arange(W) + 0.5) / W * 2 - 1
-        v = (torch.arange(H) + 0.5) / H * 2 - 1
-        here = torch.stack(torch.broadcast_tensors(u[None, :], v[:, None]), -1)
-        back = pooled((where - here).clamp(-1.5, 1.5).permute(0, 1, 4, 2, 3))
-        distance = points.norm(dim=1, keepdim=True).clamp(min=0.1)
-        # What is erased can only be seen in earlier frames: that teaches to look there.
-        unseen = gone.flatten(0, 1)[:, None].float().repeat_interleave(CELLS, 2).repeat_interleave(CELLS, 3)
-        colour = (out[:, 6:] - pooled(batch["images"])).abs().mean(1, keepdim=True)
-        return ((out[:, :1] - log_depth).abs().mean() + ((out[:, 1:4] - points).abs() / distance).mean()
-                + 2 * (out[:, 4:6] - back).abs().mean() + 2 * (colour * unseen).sum() / unseen.sum().clamp(min=1))
-
-
-def erased(images):
-    """Images [B, S, 3, H, W] with patches of later frames in their mean colour, and which: [B, S, h, w]."""
-    B, S, _, H, W = images.shape
-    gone = torch.rand(B, S, H // 14, W // 14) < ERASED
-    gone[:, 0] = False
-    gone[torch.rand(B) < 0.5] = False
-    pixels = gone.repeat_interleave(14, 2).repeat_interleave(14, 3)[:, :, None]
-    return torch.where(pixels, images.mean((1, 3, 4), keepdim=True), images), gone
-
-
 def gradient_error(error):
     """How unevenly the error lies, over three scales."""
     total = 0
@@ -137,6 +89,8 @@ def objective(out, batch):
     error = out["depth"].log() - batch["depth"].log()
     absolute = error.abs()
     depth = absolute.mean()
+    # What is taken for far though it is near weighs more than its logarithm says.
+    relative = error.clamp(max=1.1).expm1().abs().mean()
     gradient = gradient_error(error)
     # Its best value is 1 / error; it learns from the error and does not weigh it.
     confidence = (out["confidence"] * absolute.detach() - out["confidence"].log()).mean()
@@ -146,9 +100,9 @@ def objective(out, batch):
     shift, turn, view = off[:3].mean(), off[3:7].mean(), off[7:].mean()
     # L1 alone leaves the short translations of hand-held cameras unlearnt.
     direction = direction_error(out["pose"][..., -1, :3], batch["pose"][..., :3])
-    loss = depth + 0.5 * gradient + 0.05 * confidence + 3 * shift + 6 * turn + view + 0.05 * direction
-    return loss, {"direction": direction, "depth": depth, "gradient": gradient, "confidence": confidence, "shift": shift, "turn": turn,
-                  "view": view}
+    loss = depth + 0.4 * relative + 0.5 * gradient + 0.07 * confidence + 10 * shift + 20 * turn + 0.7 * view + 0.3 * direction
+    return loss, {"direction": direction, "depth": depth, "relative": relative, "gradient": gradient, "confidence": confidence,
+                  "shift": shift, "turn": turn, "view": view}
 
 
 def write_safetensors(path, tensors, metadata):

@@ -2,6 +2,7 @@
 // The scene generator for Python: plain arrays in, plain arrays out.
 #include <algorithm>
 #include <cstring>
+#include <numeric>
 
 #include "weights/small_model/scene.h"
 
@@ -43,10 +44,14 @@ int small_model_render(std::uint64_t seed, int frames, int height, int width, st
       cam_from_world[12 * s + 4 * row + 3] = pose.t[row];
     }
   }
-  // What is so near that it fills the picture teaches nothing.
-  std::size_t near = 0;
-  for (std::size_t i = 0; i < pixels; ++i) near += depth[i] < 0.12f ? 1 : 0;
-  return near * 10 > pixels ? 1 : 0;
+  // Nobody films with something right before the lens, or walks on when something comes there.
+  const double mean = std::accumulate(depth, depth + pixels, 0.0) / static_cast<double>(pixels);
+  for (int s = 0; s < frames; ++s) {
+    const float* at = depth + static_cast<std::size_t>(s) * pixels;
+    const auto near = std::count_if(at, at + pixels, [&](float d) { return d < 0.2 * mean; });
+    if (static_cast<std::size_t>(near) * 12 > pixels) return 1;
+  }
+  return 0;
 }
 
 }  // extern "C"

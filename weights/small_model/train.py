@@ -22,8 +22,10 @@ import time
 import torch
 
 import evaluate
+import matching
 import model as small
 import scenes
+from helper import Helper
 from muon import Muon
 
 TRAIN_SEED = 10_000_000      # batch k of stage s: TRAIN_SEED * (s + 1) + 64 k
@@ -84,7 +86,9 @@ class Run:
         self.stages = [Stage(text) for text in args.stage]
         self.config = small.load_config(args.config)
         self.model = small.make_model(self.config, args.seed)
-        self.helper = small.Helper(self.config)
+        matching.watch(self.model)
+        self.helper = Helper(self.config)
+        self.helper.watch(self.model)
         self.average = small.make_model(self.config, args.seed)
         self.dense = [*self.model.aggregator.parameters(), *self.model.depth_head.parameters()]
         matrices = {name: p for name, p in self.model.named_parameters() if has_muon(name, p)}
@@ -131,17 +135,17 @@ class Run:
         self.stage, self.step, self.total, self.spent = (state[k] for k in ("stage", "step", "total", "spent"))
 
     def one_step(self, clips, rate):
-        batch = {k: torch.from_numpy(v) for k, v in scenes.targets(clips).items() if v.dtype == "float32"}
+        batch = {k: torch.from_numpy(v) for k, v in scenes.targets(clips).items()}
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         self.muon.lr = MUON_RATE * rate
-        images, gone = small.erased(batch["images"])
-        out = self.model.clips(images, self.bf16)
+        out = self.model.clips(batch["images"], self.bf16)
         loss, terms = small.objective(out, batch)
-        terms["helper"] = self.helper.loss(out["taps"][-1], batch, gone)
+        terms["helper"], terms["back"] = self.helper.loss(out["taps"], batch)
+        terms["matching"], terms["matched"] = matching.loss(self.model, batch, 1 + self.config["num_register_tokens"])
         self.model.zero_grad(set_to_none=True)
         self.helper.zero_grad(set_to_none=True)
-        (loss + 0.5 * terms["helper"]).backward()
+        (loss + 0.6 * terms["helper"] + 0.12 * terms["matching"]).backward()
         # Apart, because the camera head's iterations make its gradients far larger.
         norm = torch.nn.utils.clip_grad_norm_(self.dense, 1.0)
         norm = norm + torch.nn.utils.clip_grad_norm_(self.model.camera_head.parameters(), 1.0)

@@ -19,7 +19,7 @@ struct BundledFile {
 
 // The trained small geometry model; its card is weights/small_model/README.md.
 inline constexpr BundledFile kSmallModel{
-    "lvggt_small.safetensors", "64303b5c854f1b6291300433cf534292831d6e3bc5981a55e732c4b7d0da9b48"};
+    "lvggt_small.safetensors", "313b19abaa521a45d46a1df00558915b2571a14251f6f0cfa8aeac043ba83e8b"};
 
 // Checks that `path` is that file. Throws kRead when there is none and kMismatch when its content
 // is another; both name the path and the expected sum.

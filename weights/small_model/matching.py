@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Teaches the global blocks where to look: what a patch of a later frame shows was somewhere in the first frame and in
+the frame before, and the renderer knows where. Two heads of each block learn to attend there. Without it small models
+learn depth from single pictures and never compare frames; their cameras then have no direction."""
+import torch
+import torch.nn.functional as F
+
+BLOCKS = (0, 1, 2)  # of the global blocks
+ALIKE = 0.06        # of log depth: the same surface
+
+
+def watch(model):
+    for i in BLOCKS:
+        model.aggregator.global_blocks[i].attn.kept = []
+
+
+def cells(x, step):
+    """The values in the middle of each patch: [..., H, W] -> [..., h, w]."""
+    return x[..., step // 2::step, step // 2::step]
+
+
+def seen_in(points, depth, objects, here, rotation, translation, tangent):
+    """Weights [B, h * w, h * w]: on which patches of the frame with `depth`, `objects` [B, H, W] and its camera lies what the
+    patches of another frame show, points [B, h, w, 3] of the objects `here`; zeros where it is not in sight. And a mask
+    [B, h * w] of those that moved by a patch or more."""
+    B, h, w, _ = points.shape
+    H, W = depth.shape[1:]
+    p = torch.einsum("bij,bhwj->bhwi", rotation, points) + translation[:, None, None]
+    z = p[..., 2].clamp(min=0.02)
+    place = p[..., :2] / z[..., None] / tangent[:, None, None]  # -1 to 1: width, height
+    x, y = (place[..., 0] + 1) / 2 * W - 0.5, (place[..., 1] + 1) / 2 * H - 0.5
+    column, row = x.round().long().clamp(0, W - 1), y.round().long().clamp(0, H - 1)
+    clip = torch.arange(B)[:, None, None]
+    alike = (depth[clip, row, column].log() - z.log()).abs() < ALIKE
+    visible = (p[..., 2] > 0.02) & (place.abs() < 1).all(-1) & alike & (objects[clip, row, column] == here)
+    # Shared among the four nearest patches: the place within a patch is taught as well.
+    column, row = ((place[..., 0] + 1) / 2 * w - 0.5).clamp(0, w - 1), ((place[..., 1] + 1) / 2 * h - 0.5).clamp(0, h - 1)
+    across = F.relu(1 - (column[..., None] - torch.arange(w)).abs())
+    down = F.relu(1 - (row[..., None] - torch.arange(h)).abs())
+    moved = torch.hypot(column - torch.arange(w), row - torch.arange(h)[:, None])
+    # Neighbours guess those that hardly moved; the others have to be recognised.
+    weights = down[..., :, None] * across[..., None, :] * (visible * (0.1 + moved.clamp(max=1)))[..., None, None]
+    return weights.view(B, h * w, h * w), (visible & (moved >= 1)).view(B, h * w)
+
+
+def targets(batch, step):
+    """For each later frame, where its patches were in the first frame and in the one before: [B, S - 1, 2, h * w, h * w];
+    and which of them moved."""
+    points, objects = cells(batch["points"].permute(0, 1, 4, 2, 3), step).permute(0, 1, 3, 4, 2), batch["objects"]
+    tangent = (batch["pose"][:, 0, 7:9] / 2).tan().flip(-1)
+    rotation, translation = batch["rotation"].float(), batch["translation"].float()
+    found = [seen_in(points[:, s], batch["depth"][:, f], objects[:, f], cells(objects[:, s], step), rotation[:, f],
+                     translation[:, f], tangent) for s in range(1, points.shape[1]) for f in (0, s - 1)]
+    B, S = points.shape[:2]
+    return [torch.stack(parts, 1).view(B, S - 1, 2, *parts[0].shape[1:]) for parts in zip(*found)]
+
+
+def loss(model, batch, special):
+    """Cross-entropy of the two heads' attention, mean over the patches that are in sight; and how many of those that moved
+    are looked for in the right place."""
+    S, step = batch["depth"].shape[1], model.c["patch_size"]
+    seen = [[x[:, :2].float() for x in model.aggregator.global_blocks[i].attn.kept.pop()] for i in BLOCKS]
+    if S == 1:
+        return torch.zeros(()), torch.zeros(())
+    wanted, moved = targets(batch, step)
+    N = wanted.shape[-1]
+    P = special + N
+    total, right, sight, all_moved = 0, 0, wanted.sum().clamp(min=1), moved.sum().clamp(min=1)
+    for q, k in seen:
+        for s in range(1, S):
+            scores = q[:, :, s * P + special:(s + 1) * P] @ k[:, :, :(s + 1) * P].transpose(-1, -2) * q.shape[-1] ** -0.5
+            log = scores.log_softmax(-1)
+            for head, frame in ((0, 0), (1, s - 1)):
+                at = log[:, head, :, frame * P + special:(frame + 1) * P]
+                total = total - (wanted[:, s - 1, head] * at).sum()
+                best = wanted[:, s - 1, head].gather(-1, at.argmax(-1, keepdim=True))[..., 0]
+                right = right + (moved[:, s - 1, head] & (best > 0)).sum()
+    return total / sight / len(BLOCKS), right / all_moved / len(BLOCKS)
