@@ -10,11 +10,14 @@
 namespace lvggt::kernels {
 
 // At most kChunkRows rows times kChunkPanels panels.
-//  - its inputs for one K block (96 x 256 floats, 96 KiB) and its sums (96 x 384 floats, 144 KiB)
+//  - its inputs for one K block (144 x 256 floats, 144 KiB) and its sums (144 x 512 floats, 288
+//  KiB)
 //    stay in a second-level cache of 512 KiB together with the panels in use;
-//  - a panel is read from there once for all 96 rows.
-inline constexpr std::int64_t kChunkRows = 96;  // a multiple of every tile's rows
-inline constexpr std::int64_t kChunkPanels = 24;
+//  - a panel is read from there once for all 144 rows. Of 96, 144 and 192 rows times 16, 24 and 32
+//    panels this was the fastest (bench_gemm, 16 registers of 8 lanes, 1 MiB): by 2 % of peak
+//    before 96 x 24.
+inline constexpr std::int64_t kChunkRows = 144;  // a multiple of every tile's rows
+inline constexpr std::int64_t kChunkPanels = 32;
 
 // A product's rows and panels in row_chunks x panel_chunks nearly equal parts; rows are cut at
 // multiples of a tile's. Sums do not depend on the cut, so that it may follow the thread count.
