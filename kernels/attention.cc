@@ -215,10 +215,11 @@ void attend_block(const KeyRange& range, const KeyRange& next, std::int64_t num_
                    tiles * num_panel_groups(feature_panels)};
   }
   for_panel_groups(key_panels, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
-    tile_column_of<false>(count,
-                          {s.query_rows, num_queries, 0, 1, D, block.keys + first * D * kPanelWidth,
-                           D * kPanelWidth, s.scores + first * kPanelWidth, kScorePitch},
-                          next_keys, first / kTilePanels * tiles);
+    tile_column_of<false>(
+        count,
+        {s.query_rows, num_queries, 0, 1, 0, D, block.keys + first * D * kPanelWidth,
+         D * kPanelWidth, s.scores + first * kPanelWidth, kScorePitch},
+        next_keys, first / kTilePanels * tiles);
   });
   for (std::int64_t r = 0; r < num_queries; ++r) {
     float* scores = s.scores + r * kScorePitch;
@@ -228,7 +229,7 @@ void attend_block(const KeyRange& range, const KeyRange& next, std::int64_t num_
   for_panel_groups(feature_panels, [&](std::int64_t first, std::int64_t count) HWY_ATTR {
     tile_column_of<true>(
         count,
-        {s.score_rows, num_queries, 0, 1, num_keys, block.values + first * block.value_stride,
+        {s.score_rows, num_queries, 0, 1, 0, num_keys, block.values + first * block.value_stride,
          block.value_stride, s.outputs + first * kPanelWidth, width},
         next_values, first / kTilePanels * tiles);
   });

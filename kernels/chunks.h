@@ -10,13 +10,14 @@
 namespace lvggt::kernels {
 
 // At most kChunkRows rows times kChunkPanels panels.
-//  - its inputs for one K block (144 x 256 floats, 144 KiB) and its sums (144 x 512 floats, 288
-//  KiB)
-//    stay in a second-level cache of 512 KiB together with the panels in use;
-//  - a panel is read from there once for all 144 rows. Of 96, 144 and 192 rows times 16, 24 and 32
-//    panels this was the fastest (bench_gemm, 16 registers of 8 lanes, 1 MiB): by 2 % of peak
-//    before 96 x 24.
-inline constexpr std::int64_t kChunkRows = 144;  // a multiple of every tile's rows
+//  - its inputs for one K block, 192 x 256 floats or 192 KiB, stay in a second-level cache of
+//    512 KiB with the panels in use; they are read where they lie, since copying them closer cost
+//    4 % and saved nothing;
+//  - its sums, 192 x 512 floats, pass through once for each K block;
+//  - a panel is read from the third level once for all 192 rows.
+// Of 96 to 288 rows times 16 to 48 panels, from 192 x 32 on more made no difference (bench_gemm,
+// 16 registers of 8 lanes, 1 MiB); 96 x 24 with copied inputs is slower by 5 % of peak.
+inline constexpr std::int64_t kChunkRows = 192;  // a multiple of every tile's rows
 inline constexpr std::int64_t kChunkPanels = 32;
 
 // A product's rows and panels in row_chunks x panel_chunks nearly equal parts; rows are cut at
@@ -45,7 +46,7 @@ struct Chunks {
 };
 
 // The cut that ends first when `threads` threads take chunks in turn. In units of one tile times
-// one panel, a chunk of u tiles and p panels costs u p to multiply, about 0.7 u to copy its rows
+// one panel, a chunk of u tiles and p panels costs u p to multiply, about 0.7 u to fetch its rows
 // and 0.5 p to fetch its panels (measured at K = 1024 on cores with 32 KiB and 512 KiB of cache).
 inline Chunks plan_chunks(std::int64_t M, std::int64_t panels, std::int64_t tile_rows,
                           std::int64_t threads) {

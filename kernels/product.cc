@@ -20,9 +20,7 @@ namespace lvggt::kernels {
 
 // What one worker needs for one chunk.
 struct ChunkScratch {
-  float* input = nullptr;              // [kChunkRows, kInputPitch]
-  float* sums = nullptr;               // [kChunkRows, kSumPitch]
-  const float** input_rows = nullptr;  // [kChunkRows]
+  float* sums = nullptr;     // [kChunkRows, kSumPitch]
   float* widened = nullptr;  // [kTilePanels, kMostLines, 16]: lines of narrow weights as floats
 };
 // Panels of the widest tile of any instruction set.
@@ -34,20 +32,6 @@ inline constexpr std::int64_t kMaxTilePanels = 3;
 HWY_BEFORE_NAMESPACE();
 namespace lvggt::kernels::HWY_NAMESPACE {
 namespace {
-
-// Copies [k0, k1) of the chunk's rows of one tap side by side, and points the row table there.
-void copy_inputs(const RowTable& table, std::int64_t tap, std::int64_t k0, std::int64_t k1,
-                 const ChunkScratch& scratch) {
-  const Floats d;
-  for (std::int64_t r = 0; r < table.capacity; ++r) {
-    const float* HWY_RESTRICT from = table.x[tap * table.capacity + r] + k0;
-    float* HWY_RESTRICT to = scratch.input + r * kInputPitch;
-    std::int64_t k = 0;
-    for (; k + kLanes <= k1 - k0; k += kLanes) hn::StoreU(hn::LoadU(d, from + k), d, to + k);
-    for (; k < k1 - k0; ++k) to[k] = from[k];
-    scratch.input_rows[r] = to;
-  }
-}
 
 struct Panels {
   const float* lines;
@@ -80,16 +64,17 @@ Prefetch prefetch_panels(const Product& p, std::int64_t panel, std::int64_t coun
           panel_lines * line_bytes, parts};
 }
 
-// A K block: `taps` taps of K values each, for all rows and panels of a chunk.
+// A K block: values [k0, k0 + K) of `taps` taps, for all rows and panels of a chunk.
 struct Block {
   const float* const* rows;  // [taps, row_stride], addresses
   std::int64_t row_stride;
   std::int64_t taps;
+  std::int64_t k0;
   std::int64_t K;
   std::int64_t line;  // where the block starts inside a panel
   bool is_first;
   bool is_last;
-  // Inputs that the next block copies: bytes [next_offset, next_offset + next_bytes) of next_rows.
+  // Inputs of the next block: bytes [next_offset, next_offset + next_bytes) of next_rows.
   const float* const* next_rows = nullptr;
   std::int64_t next_offset = 0;
   std::int64_t next_bytes = 0;
@@ -120,9 +105,8 @@ void run_block(const Product& p, const RowTable& table, std::int64_t panel0, std
     float* sums = scratch.sums + first * kPanelWidth;
     const std::int64_t n0 = panel * kPanelWidth;
     const std::int64_t n1 = std::min(p.w.N, n0 + count * kPanelWidth);
-    const TileColumn column{block.rows,    table.count, block.row_stride,
-                            block.taps,    block.K,     panels.lines,
-                            panels.stride, sums,        kSumPitch};
+    const TileColumn column{block.rows, table.count,  block.row_stride, block.taps, block.k0,
+                            block.K,    panels.lines, panels.stride,    sums,       kSumPitch};
     if (block.is_first) {
       tile_column_of<false>(count, column, next, 0);
     } else {
@@ -137,16 +121,16 @@ void run_chunk(const Product& p, const RowTable& table, std::int64_t panel0, std
                const ChunkScratch& scratch) {
   const std::int64_t taps = p.taps;
   const std::int64_t K = p.K;
-  if (K > kBlockK) {  // each tap in several blocks, its rows copied so that they lie densely
+  if (K > kBlockK) {  // each tap in several blocks
     const std::int64_t blocks = (K + kBlockK - 1) / kBlockK;
     for (std::int64_t t = 0; t < taps; ++t) {
       for (std::int64_t b = 0; b < blocks; ++b) {
         const std::int64_t k0 = K * b / blocks;
         const std::int64_t k1 = K * (b + 1) / blocks;
-        copy_inputs(table, t, k0, k1, scratch);
-        Block block{scratch.input_rows,
-                    0,
+        Block block{table.x + t * table.capacity,
+                    table.capacity,
                     1,
+                    k0,
                     k1 - k0,
                     t * K + k0,
                     t == 0 && b == 0,
@@ -160,13 +144,13 @@ void run_chunk(const Product& p, const RowTable& table, std::int64_t panel0, std
         run_block(p, table, panel0, panel1, block, scratch);
       }
     }
-  } else {  // several taps in one block, read where they are
+  } else {  // several taps in one block
     const std::int64_t group = std::max<std::int64_t>(1, kMostLines / std::max<std::int64_t>(K, 1));
     const std::int64_t blocks = (taps + group - 1) / group;
     for (std::int64_t b = 0; b < blocks; ++b) {
       const std::int64_t t0 = taps * b / blocks, t1 = taps * (b + 1) / blocks;
       run_block(p, table, panel0, panel1,
-                {table.x + t0 * table.capacity, table.capacity, t1 - t0, K, t0 * K, b == 0,
+                {table.x + t0 * table.capacity, table.capacity, t1 - t0, 0, K, t0 * K, b == 0,
                  b == blocks - 1},
                 scratch);
     }
@@ -194,9 +178,7 @@ void run_product(const Product& product, FunctionRef<void(const RowTable&)> gath
 
   Arena::Scope scope(ctx.arena());
   const std::int64_t workers = ctx.num_threads();
-  const auto inputs = ctx.arena().alloc(Shape{workers, kChunkRows, kInputPitch});
   const auto sums = ctx.arena().alloc(Shape{workers, kChunkRows, kSumPitch});
-  const auto input_rows = ctx.arena().alloc<const float*>(Shape{workers, kChunkRows});
   const auto x_rows = ctx.arena().alloc<const float*>(Shape{workers, product.taps, kChunkRows});
   const auto y_rows = ctx.arena().alloc<float*>(Shape{workers, kChunkRows});
   const bool narrow = w.storage != Storage::kF32;
@@ -225,8 +207,7 @@ void run_product(const Product& product, FunctionRef<void(const RowTable&)> gath
         }
         const Chunks::Range panel_range = chunks.panels_of(chunk);
         run(product, table, panel_range.begin, panel_range.end,
-            {inputs[worker].data(), sums[worker].data(), input_rows[worker].data(),
-             widened[worker].data()});
+            {sums[worker].data(), widened[worker].data()});
       },
       ctx);
 }

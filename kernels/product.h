@@ -18,9 +18,7 @@ namespace lvggt::kernels {
 inline constexpr std::int64_t kBlockK = 256;
 // The same for several taps together: 9 taps of 32 channels are one block.
 inline constexpr std::int64_t kMostLines = 320;
-// Row pitch of copied inputs: not a multiple of 4 KiB, so that rows do not compete for the same
-// cache sets.
-inline constexpr std::int64_t kInputPitch = kBlockK + 16;
+// Row pitch of sums: not a multiple of 4 KiB, so that rows do not compete for the same cache sets.
 inline constexpr std::int64_t kSumPitch = kChunkPanels * kPanelWidth + 16;
 
 // Rows [begin, begin + count) of a product, as addresses: a linear layer has one input row for each
@@ -28,7 +26,7 @@ inline constexpr std::int64_t kSumPitch = kChunkPanels * kPanelWidth + 16;
 struct RowTable {
   std::int64_t begin = 0;
   std::int64_t count = 0;
-  int worker = 0;                    // whose scratch may hold copied inputs
+  int worker = 0;                    // whose scratch gathered inputs may use
   std::int64_t capacity = 0;         // distance between the inputs of two taps
   const float** x = nullptr;         // [taps, capacity]
   float** y = nullptr;               // [capacity]

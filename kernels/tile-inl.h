@@ -32,10 +32,11 @@ inline constexpr int kPanelVectors = static_cast<int>(kPanelWidth) / kLanes;
 
 // The operands of one column of tiles: num_rows rows times a few panels.
 struct TileColumn {
-  const float* const* rows;  // [taps, row_table_stride], addresses of [K] values
+  const float* const* rows;  // [taps, row_table_stride], addresses of at least k0 + K values
   std::int64_t num_rows;
   std::int64_t row_table_stride;
   std::int64_t taps;
+  std::int64_t k0;
   std::int64_t K;
   const float* panels;        // lines of 16, taps * K a panel
   std::int64_t panel_stride;  // floats between two panels
@@ -43,8 +44,8 @@ struct TileColumn {
   std::int64_t out_stride;
 };
 
-// out[r][n] (+)= sum over taps t and k < K of rows[t * row_table_stride + r][k] * panels[n / 16][t
-// * K + k][n % 16]
+// out[r][n] (+)= sum over taps t and k < K of
+//   rows[t * row_table_stride + r][k0 + k] * panels[n / 16][t * K + k][n % 16]
 //   for r < num_rows and n < 16 kPanels. Rows are read in whole tiles: callers point the ones
 //   beyond the matrix at any readable row and drop their sums.
 // `next` is fetched meanwhile, from its part `part` on, one a tile.
@@ -71,7 +72,7 @@ HWY_NOINLINE void tile_column(const TileColumn& column, const Prefetch& next, st
       const float* HWY_RESTRICT row[kTileRows];
 #pragma GCC unroll 8
       for (int r = 0; r < kTileRows; ++r) {
-        row[r] = column.rows[t * column.row_table_stride + first + r];
+        row[r] = column.rows[t * column.row_table_stride + first + r] + column.k0;
       }
       const float* HWY_RESTRICT line = column.panels + t * K * kPanelWidth;
 #pragma GCC unroll 1

@@ -48,7 +48,7 @@ struct WinogradScratch {
   float* inputs;           // [16, T, Cin + kInputGap]: B^T d B
   float* products;         // [16, T, kTurnPitch]
   float* sums;             // [4 T, kSumPitch], pixels of the turn
-  const float** rows;      // [16 * K blocks, T]
+  const float** rows;      // [16, T]
   float** y_rows;          // [4 T]
   const float** residual;  // [4 T]
   std::int64_t* pixels;    // [4 T]: which of a tile's sums each row of the table is
@@ -173,10 +173,11 @@ void multiply(const WinogradRun& run, std::int64_t first, std::int64_t count,
       for (std::int64_t block = 0; block < blocks; ++block) {
         const std::int64_t k0 = Cin * block / blocks, k1 = Cin * (block + 1) / blocks;
         const float* lines = panels + (p * Cin + k0) * kPanelWidth;
-        const TileColumn column{scratch.rows + (p * blocks + block) * T,
+        const TileColumn column{scratch.rows + p * T,
                                 num_tiles,
                                 T,
                                 1,
+                                k0,
                                 k1 - k0,
                                 lines,
                                 panel_size,
@@ -233,19 +234,16 @@ void transform_products(const RowTable& table, std::int64_t width, std::int64_t 
 void run_tiles(const WinogradRun& run, std::int64_t begin, std::int64_t end,
                const WinogradScratch& scratch) {
   const std::int64_t Cin = run.x.extent(3), T = chunk_tiles(Cin), pitch = Cin + kInputGap;
-  const std::int64_t num_tiles = end - begin, blocks = (Cin + kBlockK - 1) / kBlockK;
+  const std::int64_t num_tiles = end - begin;
   RowTable table;
   table.capacity = 4 * T;
   table.y = scratch.y_rows;
   table.residual = scratch.residual;
   gather_tiles(run, begin, end, table, scratch);
   for (std::int64_t p = 0; p < kPositions; ++p) {
-    for (std::int64_t block = 0; block < blocks; ++block) {
-      // Tiles are read whole: what lies beyond the last one repeats it.
-      for (std::int64_t t = 0; t < T; ++t)
-        scratch.rows[(p * blocks + block) * T + t] =
-            scratch.inputs + (p * T + std::min(t, num_tiles - 1)) * pitch + Cin * block / blocks;
-    }
+    // Tiles are read whole: what lies beyond the last one repeats it.
+    for (std::int64_t t = 0; t < T; ++t)
+      scratch.rows[p * T + t] = scratch.inputs + (p * T + std::min(t, num_tiles - 1)) * pitch;
   }
   const std::int64_t panels = num_panels(run.product.w.N);
   for (std::int64_t first = 0; first < panels; first += kTurnPanels) {
@@ -314,7 +312,7 @@ void run_winograd(View<float, 4> y, View<const float, 4> x, const PackedPanels& 
   if (x.size() == 0) return;
   Arena& arena = ctx.arena();
   Arena::Scope scope(arena);
-  const std::int64_t T = chunk_tiles(Cin), blocks = (Cin + kBlockK - 1) / kBlockK;
+  const std::int64_t T = chunk_tiles(Cin);
   const std::int64_t workers = ctx.num_threads();
   const View<float, 1> zeros = arena.alloc(Shape{Cin});
   std::fill_n(zeros.data(), Cin, 0.0f);
@@ -337,7 +335,7 @@ void run_winograd(View<float, 4> y, View<const float, 4> x, const PackedPanels& 
   const auto inputs = arena.alloc(Shape{workers, kPositions, T, Cin + kInputGap});
   const auto products = arena.alloc(Shape{workers, kPositions, T, kTurnPitch});
   const auto sums = arena.alloc(Shape{workers, 4 * T, kSumPitch});
-  const auto rows = arena.alloc<const float*>(Shape{workers, kPositions * blocks, T});
+  const auto rows = arena.alloc<const float*>(Shape{workers, kPositions, T});
   const auto y_rows = arena.alloc<float*>(Shape{workers, 4 * T});
   const auto residual = arena.alloc<const float*>(Shape{workers, 4 * T});
   const auto pixels = arena.alloc<std::int64_t>(Shape{workers, 4 * T});
