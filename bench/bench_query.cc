@@ -89,6 +89,28 @@ BENCHMARK(answer)
     ->MeasureProcessCPUTime()
     ->UseRealTime();
 
+// The share of a state's answer that grows with its mask: the mean cosine inside a mask of so many
+// percent of the frame.
+void state_inside(benchmark::State& state) {
+  Context ctx;
+  const Autoencoder dynamic = random_autoencoder(AutoencoderShape::dynamic());
+  const DecodedCosines decoder(dynamic, ctx);
+  const StateQuery query(decoder, unit_rows("bench.states", 1, dynamic.feature_width(), ctx), ctx);
+  const Tensor<float, 4> codes = random_codes("bench.state_codes", 1, dynamic.code_width(), ctx);
+  Tensor<std::uint8_t, 3> mask(Shape{std::int64_t{1}, kHeight, kWidth});
+  std::fill_n(mask.data(), mask.size() * state.range(0) / 100, std::uint8_t{1});
+  float similarity = 0;
+  for (auto _ : state) query.similarity({&similarity, 1}, codes.view()[0], mask.view(), ctx);
+  benchmark::DoNotOptimize(similarity);
+}
+BENCHMARK(state_inside)
+    ->ArgName("percent")
+    ->Arg(5)
+    ->Arg(20)
+    ->Arg(100)
+    ->Unit(benchmark::kMillisecond)
+    ->UseRealTime();
+
 // The codes of a frame from disk (from the file system's memory, as it is read again and again).
 void read_frame(benchmark::State& state) {
   Context ctx;
