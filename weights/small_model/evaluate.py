@@ -58,19 +58,18 @@ def score_rendered(model, generator, seed, clips, frames, height, width):
         for e, c in zip(np.abs(error), confidence):
             for ef, cf in zip(e.reshape(frames, -1), c.reshape(frames, -1)):
                 most.append(ef[cf >= np.median(cf)].mean() / max(ef.mean(), 1e-9))
-        turn.append(angle_between(rotation_of(pose[:, 1:, 3:7]), truth["rotation"][:, 1:]).ravel())
         view.append(np.degrees(np.abs(pose[..., 8] - truth["fov"][:, None, 1])).ravel())
         t, want = pose[:, 1:, :3].reshape(-1, 3), truth["translation"][:, 1:].reshape(-1, 3)
         size = np.linalg.norm(want, axis=-1)
         cosine = (t * want).sum(-1) / np.maximum(np.linalg.norm(t, axis=-1) * size, 1e-9)
         direction.append(np.degrees(np.arccos(np.clip(cosine, -1, 1)))[size > small.MOVING])
+        turn.append(angle_between(rotation_of(pose[:, 1:, 3:7]), truth["rotation"][:, 1:]).ravel()[size > small.MOVING])
         still.append(np.linalg.norm(t, axis=-1)[size < 1e-6])
     log_error, turn, direction, still = map(np.concatenate, (log_error, turn, direction, still))
-    moving = np.concatenate([turn])
     return {"log_depth": float(log_error.mean()), "log_depth_median": float(np.median(log_error)),
             "log_depth_fitted": float(np.concatenate(fitted).mean()),
             "abs_rel": float(np.concatenate(relative).mean()), "constant_log_depth": float(np.concatenate(constant).mean()),
-            "confident_half": float(np.mean(most)), "rotation_degrees": float(np.median(moving)),
+            "confident_half": float(np.mean(most)), "rotation_degrees": float(np.median(turn)) if len(turn) else math.nan,
             "direction_degrees": float(np.median(direction)) if len(direction) else math.nan,
             "moving": len(direction), "still_translation": float(np.median(still)) if len(still) else math.nan,
             "view_degrees": float(np.median(np.concatenate(view)))}
