@@ -46,8 +46,9 @@ struct Chunks {
 };
 
 // The cut that ends first when `threads` threads take chunks in turn. In units of one tile times
-// one panel, a chunk of u tiles and p panels costs u p to multiply, about 0.7 u to fetch its rows
-// and 0.5 p to fetch its panels (measured at K = 1024 on cores with 32 KiB and 512 KiB of cache).
+// one panel, a chunk of u tiles and p panels costs u p to multiply, about 0.7 u for its rows and
+// 0.5 p for its panels. Both were measured at K = 1024 when rows were still copied, on cores with
+// 32 KiB and 512 KiB of cache: they rank the cuts, they do not predict times.
 inline Chunks plan_chunks(std::int64_t M, std::int64_t panels, std::int64_t tile_rows,
                           std::int64_t threads) {
   const auto ceil_div = [](std::int64_t a, std::int64_t b) { return (a + b - 1) / b; };

@@ -6,7 +6,8 @@
 
 MODEL: a safetensors file with its configuration, or a training's checkpoint.pt (its averaged weights).
 Depth is scored in the unit the model was trained for, the first frame's mean distance, with no fitting; the
-lines "fitted" are after one scale a clip. Cameras: each later frame against the first.
+lines "fitted" are after one scale a clip. Cameras: each later frame against the first; turn and direction are medians over
+those that moved by 3 % of the mean distance or more.
 """
 import argparse
 import json
