@@ -120,13 +120,13 @@ class Maker {
     const bool from_left = std::abs(side) > 2;
     if (from_left) turn = turn * rotation({1, 0, 0}, kPi);  // keeps the thing's up
     // Somebody who stands beside or behind the thing holds it out, so that it can be seen.
-    const float away = random_.uniform(0.15f, 0.95f);
+    const float away = random_.uniform(0.3f, 1.2f);
     if (has_hand)
       objects_.add_hand(group, radius, 0.35f * random_.normal(), from_left ? -away : away);
     Group& held = scene_.groups[static_cast<std::size_t>(group)];
     held.world_from_group = {rotation({0, 1, 0}, view_turn) * turn, place};
     held.pivot = place;
-    if (random_.chance(0.75f)) let_move(group, 0.12f, 0.6f);
+    if (random_.chance(0.85f)) let_move(group, 0.12f, 0.6f);
     if (!has_hand) return;
     Group arm = held;  // a group of its own that moves alike
     arm.label = Label::kPerson;
@@ -147,11 +147,11 @@ class Maker {
     }
     scene_.seconds_per_frame = random_.log_uniform(0.04f, 0.5f);
     const float kind = random_.uniform();
-    if (kind < 0.15f) return;  // on a tripod
+    if (kind < 0.2f) return;  // on a tripod
     const float shake = random_.log_uniform(0.003f, 0.03f);
     path.shake = random_.direction() * (shake * distance);
     path.shake_turn = random_.direction() * (shake * random_.uniform(0.3f, 1.5f));
-    if (kind < 0.3f) return;  // held, but meant to stay
+    if (kind < 0.35f) return;  // held, but meant to stay
     // So much between two frames, however far apart they are.
     const float frames_per_second = 1 / scene_.seconds_per_frame;
     path.velocity =

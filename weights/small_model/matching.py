@@ -19,10 +19,10 @@ def cells(x, step):
     return x[..., step // 2::step, step // 2::step]
 
 
-def seen_in(points, depth, objects, here, rotation, translation, tangent):
+def seen_in(points, depth, objects, here, still, rotation, translation, tangent):
     """Weights [B, h * w, h * w]: on which patches of the frame with `depth`, `objects` [B, H, W] and its camera lies what the
-    patches of another frame show, points [B, h, w, 3] of the objects `here`; zeros where it is not in sight. And a mask
-    [B, h * w] of those that moved by a patch or more."""
+    patches of another frame show, points [B, h, w, 3] of the objects `here`; zeros where it is not in sight or may
+    move by itself. And a mask [B, h * w] of those that moved by a patch or more."""
     B, h, w, _ = points.shape
     H, W = depth.shape[1:]
     p = torch.einsum("bij,bhwj->bhwi", rotation, points) + translation[:, None, None]
@@ -32,7 +32,7 @@ def seen_in(points, depth, objects, here, rotation, translation, tangent):
     column, row = x.round().long().clamp(0, W - 1), y.round().long().clamp(0, H - 1)
     clip = torch.arange(B)[:, None, None]
     alike = (depth[clip, row, column].log() - z.log()).abs() < ALIKE
-    visible = (p[..., 2] > 0.02) & (place.abs() < 1).all(-1) & alike & (objects[clip, row, column] == here)
+    visible = (p[..., 2] > 0.02) & (place.abs() < 1).all(-1) & alike & (objects[clip, row, column] == here) & still
     # Shared among the four nearest patches: the place within a patch is taught as well.
     column, row = ((place[..., 0] + 1) / 2 * w - 0.5).clamp(0, w - 1), ((place[..., 1] + 1) / 2 * h - 0.5).clamp(0, h - 1)
     across = F.relu(1 - (column[..., None] - torch.arange(w)).abs())
@@ -49,8 +49,9 @@ def targets(batch, step):
     points, objects = cells(batch["points"].permute(0, 1, 4, 2, 3), step).permute(0, 1, 3, 4, 2), batch["objects"]
     tangent = (batch["pose"][:, 0, 7:9] / 2).tan().flip(-1)
     rotation, translation = batch["rotation"].float(), batch["translation"].float()
-    found = [seen_in(points[:, s], batch["depth"][:, f], objects[:, f], cells(objects[:, s], step), rotation[:, f],
-                     translation[:, f], tangent) for s in range(1, points.shape[1]) for f in (0, s - 1)]
+    found = [seen_in(points[:, s], batch["depth"][:, f], objects[:, f], cells(objects[:, s], step),
+                     cells(batch["still"][:, s], step), rotation[:, f], translation[:, f], tangent)
+             for s in range(1, points.shape[1]) for f in (0, s - 1)]
     B, S = points.shape[:2]
     return [torch.stack(parts, 1).view(B, S - 1, 2, *parts[0].shape[1:]) for parts in zip(*found)]
 

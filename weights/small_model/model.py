@@ -24,6 +24,7 @@ DEFAULTS = {
     "dpt_pos_embed_ratio": 0.1, "image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
 POSE_DISCOUNT = 0.6  # of an earlier iteration's error
 MOVING = 0.03        # of the mean distance: a translation that has a direction
+TURNING = 0.01       # sine of half the angle: a rotation that has an axis
 
 
 def load_config(path=HERE / "config.json"):
@@ -77,11 +78,11 @@ def gradient_error(error):
     return total / 3
 
 
-def direction_error(moved, wanted):
-    """One minus the cosine between translations [..., 3], mean over those that are long enough to have a direction."""
+def direction_error(said, wanted, shortest):
+    """One minus the cosine between vectors [..., 3], mean over those that are long enough to have a direction."""
     length = wanted.norm(dim=-1)
-    cosine = (moved * wanted).sum(-1) / (moved.norm(dim=-1).clamp(min=0.01) * length.clamp(min=1e-6))
-    return (1 - cosine)[length > MOVING].sum() / max(1, (length > MOVING).sum())
+    cosine = (said * wanted).sum(-1) / (said.norm(dim=-1).clamp(min=0.01) * length.clamp(min=1e-6))
+    return (1 - cosine)[length > shortest].sum() / max(1, (length > shortest).sum())
 
 
 def objective(out, batch):
@@ -98,11 +99,13 @@ def objective(out, batch):
     weight = POSE_DISCOUNT ** torch.arange(out["pose"].shape[2] - 1, -1, -1.0)
     off = ((out["pose"] - wanted).abs().mean((0, 1)) * weight[:, None]).sum(0) / weight.sum()
     shift, turn, view = off[:3].mean(), off[3:7].mean(), off[7:].mean()
-    # L1 alone leaves the short translations of hand-held cameras unlearnt.
-    direction = direction_error(out["pose"][..., -1, :3], batch["pose"][..., :3])
-    loss = depth + 0.4 * relative + 0.5 * gradient + 0.07 * confidence + 10 * shift + 20 * turn + 0.7 * view + 0.3 * direction
-    return loss, {"direction": direction, "depth": depth, "relative": relative, "gradient": gradient, "confidence": confidence,
-                  "shift": shift, "turn": turn, "view": view}
+    # L1 alone leaves the short translations and small turns of hand-held cameras unlearnt.
+    direction = direction_error(out["pose"][..., -1, :3], batch["pose"][..., :3], MOVING)
+    axis = direction_error(out["pose"][..., -1, 3:6], batch["pose"][..., 3:6], TURNING)
+    loss = depth + 0.4 * relative + 0.5 * gradient + 0.07 * confidence + 10 * shift + 20 * turn + 0.7 * view
+    return loss + 0.3 * direction + 0.6 * axis, {
+        "direction": direction, "axis": axis, "depth": depth, "relative": relative, "gradient": gradient,
+        "confidence": confidence, "shift": shift, "turn": turn, "view": view}
 
 
 def write_safetensors(path, tensors, metadata):

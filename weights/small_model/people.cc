@@ -12,7 +12,7 @@ Rigid moved(Vec3 t) { return {Mat3{}, t}; }
 void Objects::add_fingers(int group, float radius, int skin) {
   const float thick = random_.uniform(0.007f, 0.0095f), away = radius + thick;
   const float side =
-      random_.chance(0.65f) ? 1.0f : -1.0f;  // fingers behind what is held, or before
+      random_.chance(0.85f) ? 1.0f : -1.0f;  // fingers behind what is held, or before
   const auto on_circle = [&](float angle, float y) {
     return Vec3{away * std::cos(angle), y, side * away * std::sin(angle)};
   };
@@ -36,13 +36,16 @@ void Objects::add_hand(int group, float radius, float arm_slope_y, float arm_slo
             skin);
   const Vec3 along = normalized({1, arm_slope_y, arm_slope_z});
   const Vec3 wrist{radius + 0.07f, 0.005f, 0.006f};
-  const Vec3 middle = wrist + along * 0.12f, elbow = wrist + along * random_.uniform(0.24f, 0.3f);
-  const float thin = random_.uniform(0.024f, 0.03f);
-  add_limb(group, wrist, middle, thin, thin * 1.25f, skin);
-  const bool sleeve = random_.chance(0.5f);
+  const Vec3 middle = wrist + along * random_.uniform(0.09f, 0.13f),
+             elbow = wrist + along * random_.uniform(0.24f, 0.3f);
+  // A forearm is half as wide again, or more, where its muscles are: else widening would always say
+  // that the arm comes nearer.
+  const float thin = random_.uniform(0.024f, 0.03f), muscle = random_.uniform(1.25f, 1.65f);
+  add_limb(group, wrist, middle, thin, thin * muscle, skin);
+  const bool sleeve = random_.chance(0.4f);
   const int upper = sleeve ? cloth_material() : skin;
-  const float wide = sleeve ? random_.uniform(1.5f, 2) : 1.35f;
-  add_limb(group, middle, elbow, thin * (sleeve ? 1.45f : 1.25f), thin * wide, upper);
+  const float wide = muscle * (sleeve ? random_.uniform(1.15f, 1.5f) : random_.uniform(1, 1.15f));
+  add_limb(group, middle, elbow, thin * muscle * (sleeve ? 1.15f : 1.0f), thin * wide, upper);
   const Vec3 on = normalized(
       {1, arm_slope_y + random_.uniform(-0.5f, 0.5f), arm_slope_z * random_.uniform(0.3f, 2)});
   add_limb(group, elbow, elbow + on * 0.35f, thin * wide, thin * wide * 1.3f, upper);

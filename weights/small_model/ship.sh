@@ -15,5 +15,5 @@ sed -i -E "s/\"[0-9a-f]{64}\"/\"$sum\"/" ../../include/lvggt/model/small_model.h
 "$python" export.py --dump ../../tests/golden/small_model.safetensors --frames 2 "$model"
 cp "$run/log.jsonl" log.jsonl
 "$python" curve.py log.jsonl curve.svg
-size=$("$python" -c 'import json; s = json.load(open("config.json"))["img_size"]; print(f"{round(s * 3 / 4 / 14) * 14}x{s}")')
+size=$("$python" -c 'import json; s = json.load(open("config.json"))["img_size"]; print(f"{s * 3 // 4 // 14 * 14}x{s}")')
 "$python" evaluate.py "$model" --size "$size" ${cup:+--cup "$cup"} --json scores.json

@@ -19,7 +19,7 @@ struct BundledFile {
 
 // The trained small geometry model; its card is weights/small_model/README.md.
 inline constexpr BundledFile kSmallModel{
-    "lvggt_small.safetensors", "313b19abaa521a45d46a1df00558915b2571a14251f6f0cfa8aeac043ba83e8b"};
+    "lvggt_small.safetensors", "fb9ac878973efc94c56a5c5298aae6cabcbbc74f895dcc1a491718186a8d80ac"};
 
 // Checks that `path` is that file. Throws kRead when there is none and kMismatch when its content
 // is another; both name the path and the expected sum.
