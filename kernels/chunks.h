@@ -16,7 +16,7 @@ namespace lvggt::kernels {
 //  - its sums, 192 x 512 floats, pass through once for each K block;
 //  - a panel is read from the third level once for all 192 rows.
 // Of 96 to 288 rows times 16 to 48 panels, from 192 x 32 on more made no difference (bench_gemm,
-// 16 registers of 8 lanes, 1 MiB); 96 x 24 with copied inputs is slower by 5 % of peak.
+// 1 MiB); 96 x 24 with copied inputs is slower by 5 % of peak.
 inline constexpr std::int64_t kChunkRows = 192;  // a multiple of every tile's rows
 inline constexpr std::int64_t kChunkPanels = 32;
 

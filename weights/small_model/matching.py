@@ -21,8 +21,8 @@ def cells(x, step):
 
 def seen_in(points, depth, objects, here, still, rotation, translation, tangent):
     """Weights [B, h * w, h * w]: on which patches of the frame with `depth`, `objects` [B, H, W] and its camera lies what the
-    patches of another frame show, points [B, h, w, 3] of the objects `here`; zeros where it is not in sight or may
-    move by itself. And a mask [B, h * w] of those that moved by a patch or more."""
+    patches of another frame show, points [B, h, w, 3] of the objects `here`; zeros where it is not in sight or not
+    `still`. And a mask [B, h * w] of those that moved by a patch or more."""
     B, h, w, _ = points.shape
     H, W = depth.shape[1:]
     p = torch.einsum("bij,bhwj->bhwi", rotation, points) + translation[:, None, None]

@@ -38,8 +38,8 @@ void Objects::add_hand(int group, float radius, float arm_slope_y, float arm_slo
   const Vec3 wrist{radius + 0.07f, 0.005f, 0.006f};
   const Vec3 middle = wrist + along * random_.uniform(0.09f, 0.13f),
              elbow = wrist + along * random_.uniform(0.24f, 0.3f);
-  // A forearm is half as wide again, or more, where its muscles are: else widening would always say
-  // that the arm comes nearer.
+  // A forearm is up to two thirds wider where its muscles are: else widening would always say that
+  // the arm comes nearer.
   const float thin = random_.uniform(0.024f, 0.03f), muscle = random_.uniform(1.25f, 1.65f);
   add_limb(group, wrist, middle, thin, thin * muscle, skin);
   const bool sleeve = random_.chance(0.4f);
