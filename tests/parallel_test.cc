@@ -9,7 +9,7 @@
 #include <thread>
 #include <vector>
 
-#include "kernels/thread_limits.h"
+#include "kernels/core/thread_limits.h"
 #include "lvggt/core/error.h"
 #include "tests/support/files.h"
 #include "tests/support/temp_dir.h"

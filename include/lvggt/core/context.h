@@ -29,7 +29,7 @@ class Context {
   int num_threads() const { return num_threads_; }
   Arena& arena() { return arena_; }
 
-  struct Threads;  // oneTBB stays in kernels/parallel.cc
+  struct Threads;  // oneTBB stays in kernels/core/parallel.cc
   Threads& threads() { return *threads_; }
 
  private:

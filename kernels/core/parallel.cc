@@ -19,7 +19,7 @@
 #include <string>
 #include <thread>
 
-#include "kernels/thread_limits.h"
+#include "kernels/core/thread_limits.h"
 
 namespace lvggt {
 
