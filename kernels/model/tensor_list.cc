@@ -199,8 +199,8 @@ bool is_decoder_tensor(std::string_view name) {
 }
 
 bool known_unused_tensor(std::string_view name) {
-  return name.starts_with("track_head.") || name.starts_with("train.") || name == "aggregator.patch_embed.mask_token" ||
-         name.ends_with(".num_batches_tracked");
+  return name.starts_with("track_head.") || name.starts_with("train.") ||
+         name == "aggregator.patch_embed.mask_token" || name.ends_with(".num_batches_tracked");
 }
 
 }  // namespace lvggt

@@ -1,16 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
+#include "lvggt/train/checkpoint.h"
+
 #include <algorithm>
 #include <array>
 #include <charconv>
 #include <filesystem>
 
-#include "kernels/io/training_state.h"
+#include "kernels/train/training_state.h"
 #include "lvggt/io/atomic_file.h"
 #include "lvggt/io/hash.h"
 #include "lvggt/io/json.h"
 #include "lvggt/io/json_writer.h"
 #include "lvggt/io/safetensors.h"
-#include "lvggt/train/checkpoint.h"
 
 namespace lvggt {
 namespace {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "kernels/io/training_state.h"
+#include "kernels/train/training_state.h"
 
 #include "lvggt/io/hash.h"
 #include "lvggt/io/json.h"
