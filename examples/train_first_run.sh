@@ -24,12 +24,12 @@ $bin/examples/train_autoencoder "$work/cup" --supervision dynamic --learning-rat
   --encoder-widths 128,64,32,6 --decoder-widths 32,64,128,256 --encode --output "$work/state_autoencoder" --force
 
 decoder=(--tokens "$work/tokens" --config weights/small_model/config.json --features 32 --out-channels 32 64 96 96 --hidden 8
-  --batch 4 --schedule cosine --warmup-steps 10 --learning-rate 3e-3 --force)
-$bin/examples/train_decoder "$work/cup" "${decoder[@]}" --steps 180 --loss-cos 0.1 --hold-out-every 8 --evaluate-every 60 \
+  --batch 4 --schedule cosine --warmup-steps 10 --force)
+$bin/examples/train_decoder "$work/cup" "${decoder[@]}" --steps 180 --learning-rate 3e-3 --loss-cos 0.1 --hold-out-every 8 --evaluate-every 60 \
   --output "$work/decoder"
 # The states of a few frames cannot be held out: all 24 are learnt.
-$bin/examples/train_decoder "$work/cup" "${decoder[@]}" --steps 600 --loss-cos 0.2 --supervision dynamic --no-rgb \
-  --output "$work/state_decoder"
+$bin/examples/train_decoder "$work/cup" "${decoder[@]}" --supervision dynamic --no-rgb --steps 600 --learning-rate 2e-3 \
+  --loss-cos 0.5 --output "$work/state_decoder"
 
 to=$data/first_run
 for name in decoder state_decoder; do

@@ -103,7 +103,7 @@ def objective(out, batch):
     direction = direction_error(out["pose"][..., -1, :3], batch["pose"][..., :3], MOVING)
     axis = direction_error(out["pose"][..., -1, 3:6], batch["pose"][..., 3:6], TURNING)
     loss = depth + 0.4 * relative + 0.5 * gradient + 0.07 * confidence + 10 * shift + 20 * turn + 0.7 * view
-    return loss + 0.3 * direction + 0.6 * axis, {
+    return loss + 0.5 * direction + 0.8 * axis, {
         "direction": direction, "axis": axis, "depth": depth, "relative": relative, "gradient": gradient,
         "confidence": confidence, "shift": shift, "turn": turn, "view": view}
 
