@@ -9,6 +9,7 @@
 #include "examples/lift_options.h"
 #include "examples/lift_plan.h"
 #include "lvggt/cli/bundled_model.h"
+#include "lvggt/cli/freed_memory.h"
 #include "lvggt/cli/interrupt.h"
 #include "lvggt/cli/output_folder.h"
 #include "lvggt/cli/progress.h"
@@ -346,6 +347,7 @@ int lift(LiftOptions& options, int argc, char** argv) {
 }  // namespace
 
 int main(int argc, char** argv) {
+  cli::return_freed_memory();
   cli::Program program(
       "lift_video",
       "Lifts a video to a coloured, language-featured 4D point cloud: cameras, depth, RGB, "

@@ -9,6 +9,7 @@
 #include "examples/make_tokens_options.h"
 #include "examples/make_tokens_plan.h"
 #include "lvggt/cli/bundled_model.h"
+#include "lvggt/cli/freed_memory.h"
 #include "lvggt/cli/interrupt.h"
 #include "lvggt/cli/output_folder.h"
 #include "lvggt/cli/progress.h"
@@ -324,6 +325,7 @@ int run(MakeTokensOptions& options, int argc, char** argv) {
 }  // namespace
 
 int main(int argc, char** argv) {
+  cli::return_freed_memory();
   cli::Program program(
       "make_tokens",
       "Runs the frames of a scene through the frozen geometry encoder, once, and keeps the tokens "
