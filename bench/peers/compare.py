@@ -6,8 +6,8 @@
   bench/peers/compare.py [--rows REGEX] [--rounds 3] [--weights published.safetensors] [--json FILE]
 
 Each round runs every row once with each library, one after the other (a peer once for all rows that
-differ only in our storage types); the table has the medians of the rounds, each row's share of the multiply-add peak (which our benchmark measures around its own
-loop) and the fastest peer's time over ours. Peers: python3-torch (Debian's uses OpenBLAS; install
+differ only in our storage types); the table has the medians of the rounds, each row's share of the
+multiply-add peak (which our benchmark measures around its own loop) and the fastest peer's time over ours. Peers: python3-torch (Debian's uses OpenBLAS; install
 libopenblas0-pthread), and oneDNN if libdnnl-dev was there when lvggt was built. PyTorch runs with
 passive OpenMP waiting and a malloc that keeps its memory, which makes it a quarter faster than as
 installed. The frame rows need a file of weights (weights_init --seed 3 FILE) and 12 GB of memory.
