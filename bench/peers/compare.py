@@ -7,10 +7,12 @@
 
 Each round runs every row once with each library, one after the other (a peer once for all rows that
 differ only in our storage types); the table has the medians of the rounds, each row's share of the
-multiply-add peak (which our benchmark measures around its own loop) and the fastest peer's time over ours. Peers: python3-torch (Debian's uses OpenBLAS; install
-libopenblas0-pthread), and oneDNN if libdnnl-dev was there when lvggt was built. PyTorch runs with
-passive OpenMP waiting and a malloc that keeps its memory, which makes it a quarter faster than as
-installed. The frame rows need a file of weights (weights_init --seed 3 FILE) and 12 GB of memory.
+multiply-add peak (which our benchmark measures around its own loop) and the fastest peer's time over
+ours. Peers: python3-torch (Debian's uses OpenBLAS; install libopenblas0-pthread), and oneDNN if
+libdnnl-dev was there when lvggt was built. PyTorch runs with passive OpenMP waiting and a malloc that
+keeps its memory, which makes it a quarter faster than as installed. Frames: "torch" is our own
+definition of the model, "release" takes the steps of the authors' release. They need a file of weights
+(weights_init --seed 3 FILE) and 12 GB of memory.
 """
 import argparse
 import json
@@ -57,7 +59,7 @@ def rows():
     for past in (1, 3):
         for storage, cache in (("f32", "f32"), ("int8", "bf16")):
             table.append((f"frame {storage}, cache {cache}, {past} past", "bench_frame", f"{storage}/{cache}/{past + 1}",
-                          {"torch": ["frame", 518, past + 1]}))
+                          {"torch": ["frame", 518, past + 1], "release": ["release", 518, past + 1]}))
     return table
 
 
@@ -88,7 +90,7 @@ def ours(args, program, name):
 
 
 def peer(args, name, operation):
-    if name == "torch":
+    if name in ("torch", "release"):
         return float(run([args.python, HERE / "torch_peer.py", *operation], {**TUNED, **LIMITS.get(args.simd, {})}))
     return float(run([args.build / "bench" / "onednn_peer", *operation], LIMITS.get(args.simd, {})))
 
@@ -97,7 +99,7 @@ def available(args):
     """The peers that this machine has."""
     found = []
     if subprocess.run([args.python, "-c", "import torch"], capture_output=True).returncode == 0:
-        found.append("torch")
+        found += ["torch", "release"]
     if (args.build / "bench" / "onednn_peer").exists():
         found.append("onednn")
     return found
@@ -114,9 +116,9 @@ def main():
     parser.add_argument("--json", help="write every measurement there")
     args = parser.parse_args()
     chosen = [r for r in rows() if re.search(args.rows, r[0]) and (args.weights or r[1] != "bench_frame")]
-    peers = available(args)
     if not chosen:
         sys.exit(f"compare: no row matches '{args.rows}'")
+    peers = [p for p in available(args) if any(p in r[3] for r in chosen)]
     times = {label: {name: [] for name in ["lvggt", *peers]} for label, *_ in chosen}
     shares = {label: [] for label, *_ in chosen}
     for turn in range(args.rounds):
