@@ -46,6 +46,7 @@ def run_clips(model, images):
 def score_rendered(model, generator, seed, clips, frames, height, width):
     log_error, fitted, relative, most, constant = [], [], [], [], []
     turn, direction, still, view = [], [], [], []
+    turn_at = [[] for _ in range(1, frames)]
     for first in range(0, clips, 8):
         truth = scenes.targets([generator.clip(seed + i, frames, height, width)
                                 for i in range(first, min(first + 8, clips))])
@@ -64,13 +65,18 @@ def score_rendered(model, generator, seed, clips, frames, height, width):
         size = np.linalg.norm(want, axis=-1)
         cosine = (t * want).sum(-1) / np.maximum(np.linalg.norm(t, axis=-1) * size, 1e-9)
         direction.append(np.degrees(np.arccos(np.clip(cosine, -1, 1)))[size > small.MOVING])
-        turn.append(angle_between(rotation_of(pose[:, 1:, 3:7]), truth["rotation"][:, 1:]).ravel()[size > small.MOVING])
+        off = angle_between(rotation_of(pose[:, 1:, 3:7]), truth["rotation"][:, 1:])
+        moves = (size > small.MOVING).reshape(off.shape)
+        turn.append(off[moves])
+        for s, at in enumerate(turn_at):
+            at.extend(off[moves[:, s], s])
         still.append(np.linalg.norm(t, axis=-1)[size < 1e-6])
     log_error, turn, direction, still = map(np.concatenate, (log_error, turn, direction, still))
     return {"log_depth": float(log_error.mean()), "log_depth_median": float(np.median(log_error)),
             "log_depth_fitted": float(np.concatenate(fitted).mean()),
             "abs_rel": float(np.concatenate(relative).mean()), "constant_log_depth": float(np.concatenate(constant).mean()),
             "confident_half": float(np.mean(most)), "rotation_degrees": float(np.median(turn)) if len(turn) else math.nan,
+            **{f"rotation_degrees_frame_{s}": float(np.median(at)) for s, at in enumerate(turn_at, 1) if at},
             "direction_degrees": float(np.median(direction)) if len(direction) else math.nan,
             "moving": len(direction), "still_translation": float(np.median(still)) if len(still) else math.nan,
             "view_degrees": float(np.median(np.concatenate(view)))}

@@ -24,6 +24,8 @@ class Helper(nn.Module):
         self.colour = nn.Linear(C, 3 * CELLS * CELLS)
         self.back = nn.ModuleList(nn.Linear(2 * C, 2) for _ in range(len(config["taps"]) - 1))
         self.read = nn.Linear(2 * C, 4 * CELLS * CELLS)
+        for parameter in self.parameters():  # readings that know nothing yet should not push trained tokens about
+            nn.init.zeros_(parameter)
 
     def watch(self, model):
         model.aggregator.patch_embed.register_forward_hook(lambda module, given, tokens: setattr(self, "seen", tokens))

@@ -28,7 +28,7 @@ import scenes
 from helper import Helper
 from muon import Muon
 
-TRAIN_SEED = 10_000_000      # batch k of stage s: TRAIN_SEED * (s + 1) + 64 k
+TRAIN_SEED = 10_000_000      # batch k of stage s: TRAIN_SEED * (s + 1) + 64 k, ten times TRAIN_SEED further for each further --seed
 HELD_OUT_SEED = 900_000_000  # never trained on
 MUON_RATE = 3                # its learning rate beside AdamW's
 AVERAGE = 0.998              # of the running average of the weights
@@ -101,14 +101,14 @@ class Run:
                                             {"params": groups[False], "weight_decay": 0.0}],
                                            lr=0, betas=(0.9, 0.98), foreach=True)
         self.stage, self.step, self.total, self.spent, self.stop = 0, 0, 0, 0.0, False
-        self.bf16 = args.bf16
+        self.bf16, self.first_scene = args.bf16, TRAIN_SEED * (10 * (args.seed - 1) + 1)
         self.save_every, self.score_every = 60 * args.save_minutes, args.score_every
         if args.resume:
             self.load()
         elif (self.folder / "checkpoint.pt").exists():
             sys.exit(f"train.py: {self.folder} has a checkpoint; --resume continues it")
         if args.start_from:
-            weights = torch.load(args.start_from)["average"]
+            weights = evaluate.load(args.start_from, args.config).state_dict()
             self.model.load_state_dict(weights)
             self.average.load_state_dict(weights)
         (self.folder / "arguments.json").write_text(json.dumps(vars(args), indent=1))
@@ -167,7 +167,7 @@ class Run:
 
     def run_stage(self, stage, generator):
         """To its end, or until asked to stop."""
-        fresh = scenes.Batches(generator, stage.plan, TRAIN_SEED * (self.stage + 1), self.step)
+        fresh = scenes.Batches(generator, stage.plan, self.first_scene + TRAIN_SEED * self.stage, self.step)
         recent, sums, begin, clock = Recent(len(stage.kinds)), {}, time.time(), time.time()
         while stage.done(self.step, self.spent) < 1 and not self.stop:
             rate = stage.learning_rate(self.step, stage.done(self.step, self.spent), stage is self.stages[-1])
@@ -208,11 +208,11 @@ def main():
     arguments.add_argument("run")
     arguments.add_argument("--stage", action="append", required=True)
     arguments.add_argument("--config", default=str(small.HERE / "config.json"))
-    arguments.add_argument("--seed", type=int, default=1)
+    arguments.add_argument("--seed", type=int, choices=range(1, 9), default=1, help="of the first weights and of the scenes, 1 to 8")
     arguments.add_argument("--threads", type=int, default=2)
     arguments.add_argument("--bf16", action="store_true", help="products in bfloat16: faster on a CPU with AVX512_BF16")
     arguments.add_argument("--resume", action="store_true")
-    arguments.add_argument("--start-from", help="another run's checkpoint: only its averaged weights")
+    arguments.add_argument("--start-from", help="a model's safetensors, or another run's checkpoint: its averaged weights")
     arguments.add_argument("--save-minutes", type=float, default=3)
     arguments.add_argument("--score-every", type=int, default=500)
     args = arguments.parse_args()
