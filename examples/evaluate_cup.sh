@@ -27,7 +27,7 @@ annotated=$(grep -o '"file_name": *"[0-9]*' "$name/annotations/train/_annotation
 # What the bundled small model sees of each frame alone: tokens that know the frames before tell how late it is in the
 # clip, and a decoder would learn that instead of the state.
 "$programs/examples/make_tokens" "$name" --max-past-frames 1 --out tokens --resume
-decoder=(--tokens tokens --config "$here/weights/small_model/config.json" --features 32 --out-channels 32 64 96 96 --hidden 8
+decoder=(--tokens tokens --config "$here/weights/small_model/config.json" --out-channels 32 64 96 96
   --held-out-frames "$annotated" --batch 4 --schedule cosine --warmup-steps 10 --evaluate-every 100 --loss-cos 0.5 --resume)
 "$programs/examples/train_decoder" "$name" "${decoder[@]}" --steps 600 --learning-rate 2e-3 --ema 0.98 --output decoder
 "$programs/examples/train_decoder" "$name" "${decoder[@]}" --supervision dynamic --no-rgb --steps 500 --learning-rate 2e-3 \

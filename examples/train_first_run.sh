@@ -23,7 +23,7 @@ $bin/examples/train_autoencoder "$work/cup" --supervision clip --learning-rate 2
 $bin/examples/train_autoencoder "$work/cup" --supervision dynamic --learning-rate 2e-3 --epochs 400 \
   --encoder-widths 128,64,32,6 --decoder-widths 32,64,128,256 --encode --output "$work/state_autoencoder" --force
 
-decoder=(--tokens "$work/tokens" --config weights/small_model/config.json --features 32 --out-channels 32 64 96 96 --hidden 8
+decoder=(--tokens "$work/tokens" --config weights/small_model/config.json --out-channels 32 64 96 96
   --batch 4 --schedule cosine --warmup-steps 10 --force)
 $bin/examples/train_decoder "$work/cup" "${decoder[@]}" --steps 180 --learning-rate 3e-3 --loss-cos 0.1 --hold-out-every 8 --evaluate-every 60 \
   --output "$work/decoder"

@@ -4,10 +4,9 @@
   torch_peer.py linear M N K | attention NQ NK | block N | conv K CIN COUT H W | bilinear C
   torch_peer.py frame SIZE FRAMES   a streamed frame of the published configuration (random weights):
                                     the last of FRAMES, 294 x 518 pixels for SIZE 518
-  torch_peer.py release SIZE FRAMES the same frame in the steps of the authors' release, see Release
+  torch_peer.py release SIZE FRAMES the same frame in the steps of the authors' release, see torch_release.py
 """
 import json
-import math
 import os
 import pathlib
 import statistics
@@ -89,69 +88,9 @@ PUBLISHED = json.loads("""{
   "image_std": [0.229, 0.224, 0.225]}""")
 
 
-class Release:
-    """What the release does in a streamed frame and our definition of the model spares itself: the cache has keys as they
-    came, and each frame normalises and rotates all of them once more, a half of a head at a time; sines and cosines of
-    every pixel's place are computed anew."""
-
-    @staticmethod
-    def rotate(tokens, rope, frames):
-        """tokens: [B, heads, N, D]; rope.positions: [P, 2], repeated for each of the frames"""
-        positions = rope.positions.repeat(frames, 1)
-        halves = []
-        for half, place in zip(tokens.chunk(2, -1), positions.unbind(-1)):
-            cos, sin = (F.embedding(place, table) for table in rope.tables)
-            first, second = half.chunk(2, -1)
-            halves.append(half * cos + torch.cat([-second, first], -1) * sin)
-        return torch.cat(halves, -1)
-
-    @staticmethod
-    def attention(self, x, rope=None, cache=None, mask=None):
-        B, N, C = x.shape
-        q, k, v = self.qkv(x).reshape(B, N, 3, self.heads, C // self.heads).permute(2, 0, 3, 1, 4).unbind(0)
-        frames = 1
-        if cache is not None:
-            k, v = k[:, :, None], v[:, :, None]
-            if cache:
-                k, v = (torch.cat([past, new], 2) for past, new in zip(cache[0], (k, v)))
-            cache[:] = [(k, v)]
-            frames = k.shape[2]
-            k, v = k.flatten(2, 3), v.flatten(2, 3)
-        q, k = self.q_norm(q), self.k_norm(k)
-        if rope is not None:
-            q, k = Release.rotate(q, rope, 1), Release.rotate(k, rope, frames)
-        weights = ((q * q.shape[-1] ** -0.5) @ k.transpose(-2, -1)).softmax(-1)
-        return self.proj((weights @ v).transpose(1, 2).reshape(B, N, C))
-
-    @staticmethod
-    def position_embedding(h, w, dim, aspect, ratio=0.1):
-        diagonal = math.sqrt(aspect * aspect + 1)
-        spans = [(w, aspect / diagonal), (h, 1 / diagonal)]
-        axes = [torch.linspace(-span * (n - 1) / n, span * (n - 1) / n, n) for n, span in spans]
-        omega = 100.0 ** (-torch.arange(dim // 4, dtype=torch.float64) / (dim / 4))
-        angles = [place.reshape(-1, 1) * omega for place in torch.meshgrid(*axes, indexing="xy")]
-        table = torch.cat([f(a) for a in angles for f in (torch.sin, torch.cos)], -1).float()
-        return ratio * table.view(h, w, dim).permute(2, 0, 1)
-
-    @staticmethod
-    def use():
-        import torch_geometry
-
-        class Rope(torch_geometry.Rope2d):
-            def __init__(self, h, w, head_dim, base=100.0, special=5):
-                super().__init__(h, w, head_dim, base, special)
-                rows, columns = torch.meshgrid(torch.arange(h) + 1, torch.arange(w) + 1, indexing="ij")
-                places = torch.stack([rows, columns], -1).flatten(0, 1)
-                self.positions = torch.cat([torch.zeros(special, 2, dtype=torch.long), places])
-                self.tables = torch_geometry.rope_tables(torch.arange(max(h, w) + 1), head_dim // 2, base)
-
-        torch_geometry.Rope2d = Rope
-        torch_geometry.Attention.forward = Release.attention
-        torch_geometry.position_embedding = Release.position_embedding
-
-
 def release(size, frames):
-    Release.use()
+    import torch_release
+    torch_release.use()
     return frame(size, frames)
 
 

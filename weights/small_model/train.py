@@ -28,7 +28,7 @@ import scenes
 from helper import Helper
 from muon import Muon
 
-TRAIN_SEED = 10_000_000      # batch k of stage s: TRAIN_SEED * (s + 1) + 64 k, ten times TRAIN_SEED further for each further --seed
+TRAIN_SEED = 10_000_000      # batch k of stage s with --seed n: TRAIN_SEED * (10 (n - 1) + s + 1) + 64 k
 HELD_OUT_SEED = 900_000_000  # never trained on
 MUON_RATE = 3                # its learning rate beside AdamW's
 AVERAGE = 0.998              # of the running average of the weights
@@ -107,7 +107,7 @@ class Run:
             self.load()
         elif (self.folder / "checkpoint.pt").exists():
             sys.exit(f"train.py: {self.folder} has a checkpoint; --resume continues it")
-        if args.start_from:
+        elif args.start_from:
             weights = evaluate.load(args.start_from, args.config).state_dict()
             self.model.load_state_dict(weights)
             self.average.load_state_dict(weights)
