@@ -317,6 +317,26 @@ TEST_CASE("evaluate: a plan puts several runs and other wordings into one table"
   CHECK(unknown.says("run 1: methd: there is no such member"));
 }
 
+TEST_CASE("evaluate: several scenes are scored side by side, with one model for all of them") {
+  const MapScene scene;
+  const std::string pantry = scene.file("pantry");
+  fs::copy(scene.path(), pantry, fs::copy_options::recursive);
+  const std::string out = scene.file("out");
+  const ProgramResult result =
+      run_program(program("evaluate"), scene.arguments({pantry, "--out", out}));
+  INFO(result.err);
+  REQUIRE(result.status == 0);
+  CHECK(result.prints("Maps (one model for all)"));
+  const std::string csv = read_bytes(out + "/table.csv");
+  const auto score_of = [&](const std::string& name) {
+    const std::string row = "Maps,one model for all," + name + ",time-agnostic,,,,mIoU,";
+    const std::size_t at = csv.find(row);
+    REQUIRE(at != std::string::npos);
+    return csv.substr(at + row.size(), csv.find('\n', at) - at - row.size());
+  };
+  CHECK(score_of("kitchen") == score_of("pantry"));
+}
+
 TEST_CASE("evaluate: what does not fit is said in one sentence") {
   const MapScene scene;
   const auto fails = [&](const std::vector<std::string>& arguments, int status,
