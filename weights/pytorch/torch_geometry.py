@@ -275,10 +275,12 @@ class StreamVggt(nn.Module):
             self.point_head = DptHead(c, 4)
         self.c = c
 
-    def clips(self, images, bf16=False):
+    def clips(self, images, bf16=False, dense=None):
         """images: [B, S, 3, H, W] -> poses [B, S, iterations, 9] with the camera head's cache as in a
-        stream, depth and confidence [B, S, H, W], taps [B * S, h * w, 2C]. bf16: products of the
-        aggregator and the depth head in bfloat16, for training on a CPU that has them."""
+        stream, depth and confidence [B, S, H, W], and what every pair of blocks gave, [B, S, P, 2C] each. bf16:
+        products of the aggregator and the depth head in bfloat16, for training on a CPU that has them.
+        dense: the pictures b * S + s to give depth for, all of them if None; depth and confidence are then
+        [n, H, W]."""
         c, (B, S, _, H, W) = self.c, images.shape
         h, w, special = H // c["patch_size"], W // c["patch_size"], 1 + c["num_register_tokens"]
         head_dim = c["embed_dim"] // c["agg_heads"]
@@ -290,10 +292,11 @@ class StreamVggt(nn.Module):
         caches = [[] for _ in self.camera_head.trunk]
         poses = [torch.cat(self.camera_head(outputs[-1][:, s, :1], caches), 1) for s in range(S)]
         taps = [outputs[i][:, :, special:].flatten(0, 1) for i in c["taps"]]
+        shape = (B, S, H, W) if dense is None else (len(dense), H, W)
         with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-            depth, confidence = self.depth_head(taps, h, w, (H, W))
-        return {"pose": torch.stack(poses, 1), "depth": depth.view(B, S, H, W),
-                "confidence": confidence.view(B, S, H, W), "taps": taps}
+            depth, confidence = self.depth_head(taps if dense is None else [x[dense] for x in taps], h, w, (H, W))
+        return {"pose": torch.stack(poses, 1), "depth": depth.view(shape), "confidence": confidence.view(shape),
+                "blocks": outputs}
 
 
 class Stream:

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Teaches the global blocks where to look: what a patch of a later frame shows was somewhere in the first frame and in
-the frame before, and the renderer knows where. Two heads of each block learn to attend there. Without it small models
-learn depth from single pictures and never compare frames; their cameras then have no direction."""
+the frame before, and the renderer knows where. Two heads of each block but the last learn to attend there. Without it
+small models learn depth from single pictures and never compare frames; their cameras then have no direction."""
 import torch
 import torch.nn.functional as F
 
-BLOCKS = (0, 1, 2)  # of the global blocks
-ALIKE = 0.06        # of log depth: the same surface
+ALIKE = 0.06  # of log depth: the same surface
 
 
 def watch(model):
-    for i in BLOCKS:
-        model.aggregator.global_blocks[i].attn.kept = []
+    for block in model.aggregator.global_blocks[:-1]:
+        block.attn.kept = []
 
 
 def cells(x, step):
@@ -58,16 +57,17 @@ def targets(batch, step):
 
 def loss(model, batch, special):
     """Cross-entropy of the two heads' attention, mean over the patches that are in sight; and how many of those that moved
-    are looked for in the right place."""
+    are looked for in the right place by the last of them."""
     S, step = batch["depth"].shape[1], model.c["patch_size"]
-    seen = [[x[:, :2].float() for x in model.aggregator.global_blocks[i].attn.kept.pop()] for i in BLOCKS]
+    seen = [[x[:, :2].float() for x in block.attn.kept.pop()] for block in model.aggregator.global_blocks[:-1]]
     if S == 1:
         return torch.zeros(()), torch.zeros(())
     wanted, moved = targets(batch, step)
     N = wanted.shape[-1]
     P = special + N
-    total, right, sight, all_moved = 0, 0, wanted.sum().clamp(min=1), moved.sum().clamp(min=1)
+    total, sight, all_moved = 0, wanted.sum().clamp(min=1), moved.sum().clamp(min=1)
     for q, k in seen:
+        right = 0
         for s in range(1, S):
             scores = q[:, :, s * P + special:(s + 1) * P] @ k[:, :, :(s + 1) * P].transpose(-1, -2) * q.shape[-1] ** -0.5
             log = scores.log_softmax(-1)
@@ -76,4 +76,4 @@ def loss(model, batch, special):
                 total = total - (wanted[:, s - 1, head] * at).sum()
                 best = wanted[:, s - 1, head].gather(-1, at.argmax(-1, keepdim=True))[..., 0]
                 right = right + (moved[:, s - 1, head] & (best > 0)).sum()
-    return total / sight / len(BLOCKS), right / all_moved / len(BLOCKS)
+    return total / sight / len(seen), right / all_moved

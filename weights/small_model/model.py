@@ -4,6 +4,7 @@ import json
 import math
 import os
 import pathlib
+import re
 import struct
 import sys
 
@@ -69,6 +70,27 @@ def make_model(config, seed):
     return model
 
 
+def deepened(weights, pairs):
+    """The same function with more pairs of frame and global blocks: further ones before the last, copies of the one before,
+    add nothing to the tokens until they learn to. weights: a state_dict. And the names of the new weights."""
+    pair = re.compile(r"(aggregator\.(?:frame|global)_blocks)\.(\d+)\.(.*)")
+    found = {name: pair.fullmatch(name) for name in weights}
+    last = max(int(m[2]) for m in found.values() if m)
+    out, new = {}, set()
+    for name, value in weights.items():
+        if not (m := found[name]):
+            out[name] = value
+        elif int(m[2]) == last:
+            out[f"{m[1]}.{pairs - 1}.{m[3]}"] = value
+        else:
+            out[name] = value
+            for i in range(last, pairs - 1) if int(m[2]) == last - 1 else ():
+                end = m[3].startswith(("attn.proj.", "mlp.fc2."))
+                out[f"{m[1]}.{i}.{m[3]}"] = torch.zeros_like(value) if end else value.clone()
+                new.add(f"{m[1]}.{i}.{m[3]}")
+    return out, new
+
+
 def gradient_error(error):
     """How unevenly the error lies, over three scales."""
     total = 0
@@ -85,9 +107,10 @@ def direction_error(said, wanted, shortest):
     return (1 - cosine)[length > shortest].sum() / max(1, (length > shortest).sum())
 
 
-def objective(out, batch):
-    """The loss and its terms."""
-    error = out["depth"].log() - batch["depth"].log()
+def objective(out, batch, dense=None):
+    """The loss and its terms. dense: the pictures out["depth"] is of, as in StreamVggt.clips."""
+    depth = batch["depth"] if dense is None else batch["depth"].flatten(0, 1)[dense]
+    error = out["depth"].log() - depth.log()
     absolute = error.abs()
     depth = absolute.mean()
     # What is taken for far though it is near weighs more than its logarithm says.
@@ -102,7 +125,7 @@ def objective(out, batch):
     # L1 alone leaves the short translations and small turns of hand-held cameras unlearnt.
     direction = direction_error(out["pose"][..., -1, :3], batch["pose"][..., :3], MOVING)
     axis = direction_error(out["pose"][..., -1, 3:6], batch["pose"][..., 3:6], TURNING)
-    loss = depth + 0.4 * relative + 0.5 * gradient + 0.07 * confidence + 10 * shift + 20 * turn + 0.7 * view
+    loss = depth + 0.4 * relative + 0.5 * gradient + 0.12 * confidence + 10 * shift + 20 * turn + 0.7 * view
     return loss + 0.5 * direction + 0.8 * axis, {
         "direction": direction, "axis": axis, "depth": depth, "relative": relative, "gradient": gradient,
         "confidence": confidence, "shift": shift, "turn": turn, "view": view}

@@ -28,10 +28,10 @@ def as_matrices(name, parameter, gradient):
 
 class Muon:
     """For a dictionary of weights with two or more dimensions. `lr` compares with AdamW's: updates are scaled
-    to a root mean square of 0.2 lr (Liu et al. 2025)."""
+    to a root mean square of 0.2 lr (Liu et al. 2025). parts: of weights that learn at a part of it."""
 
-    def __init__(self, weights, momentum=0.95, weight_decay=0.02):
-        self.weights, self.momentum, self.weight_decay, self.lr = weights, momentum, weight_decay, 0.0
+    def __init__(self, weights, parts, momentum=0.95, weight_decay=0.02):
+        self.weights, self.parts, self.momentum, self.weight_decay, self.lr = weights, parts, momentum, weight_decay, 0.0
         self.buffers = {name: torch.zeros_like(p) for name, p in weights.items()}
 
     def state_dict(self):
@@ -50,12 +50,12 @@ class Muon:
             m = as_matrices(name, p, p.grad.lerp(buffer, self.momentum))
             upright = m.shape[1] > m.shape[2]
             m = m.mT if upright else m
-            groups[m.shape[1:]].append((p, m, upright))
+            groups[m.shape[1:]].append((p, m, upright, self.lr * self.parts.get(name, 1)))
         for (rows, columns), members in groups.items():
-            update = orthogonal(torch.cat([m for _, m, _ in members])) * (0.2 * columns ** 0.5)
+            update = orthogonal(torch.cat([m for _, m, _, _ in members])) * (0.2 * columns ** 0.5)
             begin = 0
-            for p, m, upright in members:
+            for p, m, upright, lr in members:
                 u = update[begin:begin + len(m)]
                 begin += len(m)
-                p.mul_(1 - self.lr * self.weight_decay)
-                p.sub_((u.mT if upright else u).reshape(p.shape), alpha=self.lr)
+                p.mul_(1 - lr * self.weight_decay)
+                p.sub_((u.mT if upright else u).reshape(p.shape), alpha=lr)

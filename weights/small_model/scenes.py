@@ -59,13 +59,18 @@ class Generator:
 
 
 def mirrored(clip):
-    """Left and right exchanged, and the frames backwards."""
+    """Left and right exchanged."""
     flip = np.array([-1, 1, 1], np.float32)
-    camera = clip.cam_from_world[::-1].copy()
-    camera *= flip[None, :, None]
+    camera = clip.cam_from_world * flip[None, :, None]
     camera[..., :3] *= flip
-    return clip._replace(rgb=clip.rgb[::-1, :, ::-1], depth=clip.depth[::-1, :, ::-1],
-                         objects=clip.objects[::-1, :, ::-1], cam_from_world=camera)
+    return clip._replace(rgb=clip.rgb[:, :, ::-1], depth=clip.depth[:, :, ::-1], objects=clip.objects[:, :, ::-1],
+                         cam_from_world=camera)
+
+
+def backwards(clip):
+    """The last frame first."""
+    return clip._replace(rgb=clip.rgb[::-1], depth=clip.depth[::-1], objects=clip.objects[::-1],
+                         cam_from_world=clip.cam_from_world[::-1])
 
 
 class Batches:

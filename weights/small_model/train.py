@@ -5,9 +5,9 @@
   train.py RUN --stage 56x84:14x2,7x4:3000:7e-4 --stage 112x154:8x2,4x4:60m:3e-4
 
 A stage: the frames' size; the kinds of batches, taken in turns, clips x frames; how many steps, or minutes; the
-learning rate, which falls by half a cosine, to a half and in the last stage to a fiftieth. Half of a batch's clips are new, half were new a few
-steps before and come back mirrored and backwards. RUN gets checkpoint.pt (every few minutes, the weights' running
-average included), log.jsonl (losses and scores), arguments.json.
+learning rate, which falls by half a cosine, to a half and in the last stage to a fiftieth. A quarter of a batch's clips are
+new, the others come back mirrored or backwards. RUN gets checkpoint.pt (every few minutes, the weights' running average
+included), log.jsonl (losses and scores), arguments.json.
 """
 import argparse
 import collections
@@ -33,7 +33,8 @@ HELD_OUT_SEED = 900_000_000  # never trained on
 MUON_RATE = 3                # its learning rate beside AdamW's
 AVERAGE = 0.998              # of the running average of the weights
 # Memory stays with the process and threads sleep while they wait: a step takes half the time.
-TUNED = {"OMP_WAIT_POLICY": "passive", "MALLOC_MMAP_MAX_": "0", "MALLOC_TRIM_THRESHOLD_": "20000000000"}
+TUNED = {"OMP_WAIT_POLICY": "passive", "OPENBLAS_THREAD_TIMEOUT": "4", "MALLOC_MMAP_MAX_": "0",
+         "MALLOC_TRIM_THRESHOLD_": "20000000000"}
 
 
 class Stage:
@@ -46,7 +47,7 @@ class Stage:
 
     def plan(self, k):
         clips, frames = self.kinds[k % len(self.kinds)]
-        return (clips + 1) // 2, frames, self.height, self.width
+        return (clips + 3) // 4, frames, self.height, self.width
 
     def done(self, k, seconds):
         """The part of the stage that k steps and so many seconds are."""
@@ -59,17 +60,18 @@ class Stage:
 
 
 class Recent:
-    """Clips seen a few steps before, to be seen once more, mirrored and backwards."""
+    """Clips seen a few steps before, to be seen three times more: mirrored and backwards, backwards, mirrored."""
+    CHANGES = (lambda clip: scenes.mirrored(scenes.backwards(clip)), scenes.backwards, scenes.mirrored)
 
     def __init__(self, kinds):
-        self.queues, self.kinds, self.turn = [collections.deque() for _ in range(kinds)], kinds, 0
+        self.queues, self.kinds, self.turn = [collections.deque(maxlen=3) for _ in range(kinds)], kinds, 0
 
     def add_old(self, fresh, clips):
         queue = self.queues[self.turn % self.kinds]
         self.turn += 1
-        old = queue.popleft() if len(queue) >= 6 else []
+        old = [change(clip) for change, seen in zip(self.CHANGES, reversed(queue)) for clip in seen]
         queue.append(fresh)
-        return fresh + [scenes.mirrored(clip) for clip in old[:clips - len(fresh)]]
+        return fresh + old[:clips - len(fresh)]
 
 
 def has_muon(name, parameter):
@@ -91,15 +93,20 @@ class Run:
         self.helper.watch(self.model)
         self.average = small.make_model(self.config, args.seed)
         self.dense = [*self.model.aggregator.parameters(), *self.model.depth_head.parameters()]
+        parts = {}  # of weights that are trained already and learn at a part of the rate
+        if args.start_from:
+            weights, new = small.deepened(evaluate.load(args.start_from, args.config).state_dict(), self.config["agg_depth"])
+            self.model.load_state_dict(weights)
+            self.average.load_state_dict(weights)
+            parts = {name: args.trained_rate for name in weights if name not in new}
         matrices = {name: p for name, p in self.model.named_parameters() if has_muon(name, p)}
-        self.muon = Muon(matrices)
-        groups = {True: [], False: []}
+        self.muon = Muon(matrices, parts)
+        groups = {}
         for name, p in [*self.model.named_parameters(), *self.helper.named_parameters()]:
             if name not in matrices:
-                groups[p.ndim > 1].append(p)
-        self.optimiser = torch.optim.AdamW([{"params": groups[True], "weight_decay": 0.02},
-                                            {"params": groups[False], "weight_decay": 0.0}],
-                                           lr=0, betas=(0.9, 0.98), foreach=True)
+                groups.setdefault((p.ndim > 1, parts.get(name, 1)), []).append(p)
+        self.optimiser = torch.optim.AdamW([{"params": ps, "weight_decay": 0.02 * matrix, "part": part}
+                                            for (matrix, part), ps in groups.items()], lr=0, betas=(0.9, 0.98), foreach=True)
         self.stage, self.step, self.total, self.spent, self.stop = 0, 0, 0, 0.0, False
         self.bf16, self.first_scene = args.bf16, TRAIN_SEED * (10 * (args.seed - 1) + 1)
         self.save_every, self.score_every = 60 * args.save_minutes, args.score_every
@@ -107,10 +114,6 @@ class Run:
             self.load()
         elif (self.folder / "checkpoint.pt").exists():
             sys.exit(f"train.py: {self.folder} has a checkpoint; --resume continues it")
-        elif args.start_from:
-            weights = evaluate.load(args.start_from, args.config).state_dict()
-            self.model.load_state_dict(weights)
-            self.average.load_state_dict(weights)
         (self.folder / "arguments.json").write_text(json.dumps(vars(args), indent=1))
 
     def say(self, **entry):
@@ -137,11 +140,14 @@ class Run:
     def one_step(self, clips, rate):
         batch = {k: torch.from_numpy(v) for k, v in scenes.targets(clips).items()}
         for group in self.optimiser.param_groups:
-            group["lr"] = rate
+            group["lr"] = rate * group["part"]
         self.muon.lr = MUON_RATE * rate
-        out = self.model.clips(batch["images"], self.bf16)
-        loss, terms = small.objective(out, batch)
-        terms["helper"], terms["back"] = self.helper.loss(out["taps"], batch)
+        # Frames of a clip are alike: depth of a quarter of them leaves time for more clips.
+        B, S = batch["depth"].shape[:2]
+        dense = torch.cat([b * S + torch.randperm(S)[:(S + 3) // 4] for b in range(B)])
+        out = self.model.clips(batch["images"], self.bf16, dense)
+        loss, terms = small.objective(out, batch, dense)
+        terms["helper"], terms["back"] = self.helper.loss(out["blocks"], batch)
         terms["matching"], terms["matched"] = matching.loss(self.model, batch, 1 + self.config["num_register_tokens"])
         self.model.zero_grad(set_to_none=True)
         self.helper.zero_grad(set_to_none=True)
@@ -213,6 +219,8 @@ def main():
     arguments.add_argument("--bf16", action="store_true", help="products in bfloat16: faster on a CPU with AVX512_BF16")
     arguments.add_argument("--resume", action="store_true")
     arguments.add_argument("--start-from", help="a model's safetensors, or another run's checkpoint: its averaged weights")
+    arguments.add_argument("--trained-rate", type=float, default=1, help="learning rate of weights from --start-from, in parts of "
+                           "that of blocks that --config has more")
     arguments.add_argument("--save-minutes", type=float, default=3)
     arguments.add_argument("--score-every", type=int, default=500)
     args = arguments.parse_args()
