@@ -109,8 +109,8 @@ def direction_error(said, wanted, shortest):
 
 def objective(out, batch, dense=None):
     """The loss and its terms. dense: the pictures out["depth"] is of, as in StreamVggt.clips."""
-    depth = batch["depth"] if dense is None else batch["depth"].flatten(0, 1)[dense]
-    error = out["depth"].log() - depth.log()
+    truth = batch["depth"] if dense is None else batch["depth"].flatten(0, 1)[dense]
+    error = out["depth"].log() - truth.log()
     absolute = error.abs()
     depth = absolute.mean()
     # What is taken for far though it is near weighs more than its logarithm says.
