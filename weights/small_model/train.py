@@ -96,6 +96,8 @@ class Run:
         parts = {}  # of weights that are trained already and learn at a part of the rate
         if args.start_from:
             weights, new = small.deepened(evaluate.load(args.start_from, args.config).state_dict(), self.config["agg_depth"])
+            if args.start_from.endswith(".pt"):
+                self.helper.load_state_dict(torch.load(args.start_from)["helper"])
             self.model.load_state_dict(weights)
             self.average.load_state_dict(weights)
             parts = {name: args.trained_rate for name in weights if name not in new}
@@ -108,7 +110,7 @@ class Run:
         self.optimiser = torch.optim.AdamW([{"params": ps, "weight_decay": 0.02 * matrix, "part": part}
                                             for (matrix, part), ps in groups.items()], lr=0, betas=(0.9, 0.98), foreach=True)
         self.stage, self.step, self.total, self.spent, self.stop = 0, 0, 0, 0.0, False
-        self.bf16, self.first_scene = args.bf16, TRAIN_SEED * (10 * (args.seed - 1) + 1)
+        self.bf16, self.depth_part, self.first_scene = args.bf16, args.depth_part, TRAIN_SEED * (10 * (args.seed - 1) + 1)
         self.save_every, self.score_every = 60 * args.save_minutes, args.score_every
         if args.resume:
             self.load()
@@ -142,9 +144,9 @@ class Run:
         for group in self.optimiser.param_groups:
             group["lr"] = rate * group["part"]
         self.muon.lr = MUON_RATE * rate
-        # Frames of a clip are alike: depth of a quarter of them leaves time for more clips.
+        # Frames of a clip are alike: depth of a part of them leaves time for more clips.
         B, S = batch["depth"].shape[:2]
-        dense = torch.cat([b * S + torch.randperm(S)[:(S + 3) // 4] for b in range(B)])
+        dense = torch.cat([b * S + torch.randperm(S)[:math.ceil(S * self.depth_part)] for b in range(B)])
         out = self.model.clips(batch["images"], self.bf16, dense)
         loss, terms = small.objective(out, batch, dense)
         terms["helper"], terms["back"] = self.helper.loss(out["blocks"], batch)
@@ -218,9 +220,12 @@ def main():
     arguments.add_argument("--threads", type=int, default=2)
     arguments.add_argument("--bf16", action="store_true", help="products in bfloat16: faster on a CPU with AVX512_BF16")
     arguments.add_argument("--resume", action="store_true")
-    arguments.add_argument("--start-from", help="a model's safetensors, or another run's checkpoint: its averaged weights")
+    arguments.add_argument("--start-from", help="a model's safetensors, or another run's checkpoint with "
+                           "this --config: its averaged weights and its readings")
     arguments.add_argument("--trained-rate", type=float, default=1, help="learning rate of weights from --start-from, in parts of "
                            "that of blocks that --config has more")
+    arguments.add_argument("--depth-part", type=float, default=0.25, help="frames of a clip that the depth head learns from in "
+                           "a step, a part of them")
     arguments.add_argument("--save-minutes", type=float, default=3)
     arguments.add_argument("--score-every", type=int, default=500)
     args = arguments.parse_args()
