@@ -24,8 +24,12 @@ DEFAULTS = {
     "cam_qk_norm": False, "cam_ln_eps": 1e-5, "cam_adaln_eps": 1e-6, "cam_iterations": 4,
     "dpt_pos_embed_ratio": 0.1, "image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
 POSE_DISCOUNT = 0.6  # of an earlier iteration's error
+USUAL_TURN, USUAL_DIRECTION = 0.0175, 0.175  # a good camera's errors, radians
+HELD_WEIGHT = 4.0    # of the depth of what is held and of people
 MOVING = 0.03        # of the mean distance: a translation that has a direction
 TURNING = 0.01       # sine of half the angle: a rotation that has an axis
+WEIGHTS = {"depth": 1, "relative": 0.6, "gradient": 0.7, "confidence": 0.2, "shift": 10, "turn": 20, "view": 0.7,
+           "direction": 0.5, "axis": 0.8, "turned": 0.3, "headed": 0.15}  # of the objective's terms
 
 
 def load_config(path=HERE / "config.json"):
@@ -92,12 +96,13 @@ def deepened(weights, pairs):
 
 
 def gradient_error(error):
-    """How unevenly the error lies, over three scales."""
-    total = 0
-    for step in (1, 2, 4):
-        e = error[..., ::step, ::step]
-        total = total + e.diff(dim=-1).abs().mean() + e.diff(dim=-2).abs().mean()
-    return total / 3
+    """How unevenly the error lies: between neighbours, and between a hand and what it holds."""
+    total, steps = 0, (1, 2, 4, 8, 16, 32)
+    for step in steps:
+        n = min(step, 4)
+        e = error[..., ::step // n, ::step // n]
+        total = total + (e[..., n:] - e[..., :-n]).abs().mean() + (e[..., n:, :] - e[..., :-n, :]).abs().mean()
+    return total / len(steps)
 
 
 def direction_error(said, wanted, shortest):
@@ -107,28 +112,50 @@ def direction_error(said, wanted, shortest):
     return (1 - cosine)[length > shortest].sum() / max(1, (length > shortest).sum())
 
 
-def objective(out, batch, dense=None):
-    """The loss and its terms. dense: the pictures out["depth"] is of, as in StreamVggt.clips."""
-    truth = batch["depth"] if dense is None else batch["depth"].flatten(0, 1)[dense]
+def typical(off, unit):
+    """Mean of log(1 + off / unit): errors of the many small ones count as much as of the few large ones, as in a median."""
+    return (off / unit).log1p().sum() / max(1, len(off))
+
+
+def directions_apart(said, wanted, shortest):
+    """Distances on the unit sphere between directions of vectors [..., 3], of those that are long enough to have one."""
+    far = wanted.norm(dim=-1) > shortest
+    return (F.normalize(said[far], dim=-1, eps=0.01) - F.normalize(wanted[far], dim=-1)).norm(dim=-1)
+
+
+def depth_terms(out, batch, dense):
+    truth, still = (batch[k] if dense is None else batch[k].flatten(0, 1)[dense] for k in ("depth", "still"))
     error = out["depth"].log() - truth.log()
     absolute = error.abs()
-    depth = absolute.mean()
+    # What is held and people are small in most pictures, and what they are looked at for.
+    worth = torch.where(still, 1.0, HELD_WEIGHT)
+    worth = worth / worth.mean()
     # What is taken for far though it is near weighs more than its logarithm says.
-    relative = error.clamp(max=1.1).expm1().abs().mean()
-    gradient = gradient_error(error)
+    relative = error.clamp(max=1.1).expm1().abs()
     # Its best value is 1 / error; it learns from the error and does not weigh it.
-    confidence = (out["confidence"] * absolute.detach() - out["confidence"].log()).mean()
-    wanted = batch["pose"][:, :, None]
-    weight = POSE_DISCOUNT ** torch.arange(out["pose"].shape[2] - 1, -1, -1.0)
-    off = ((out["pose"] - wanted).abs().mean((0, 1)) * weight[:, None]).sum(0) / weight.sum()
-    shift, turn, view = off[:3].mean(), off[3:7].mean(), off[7:].mean()
+    confidence = out["confidence"] * absolute.detach() - out["confidence"].log()
+    return {"depth": (worth * absolute).mean(), "relative": (worth * relative).mean(), "gradient": gradient_error(error),
+            "confidence": confidence.mean()}
+
+
+def camera_terms(out, batch):
+    said, true = out["pose"], batch["pose"]
+    weight = POSE_DISCOUNT ** torch.arange(said.shape[2] - 1, -1, -1.0)
+    off = ((said - true[:, :, None]).abs().mean((0, 1)) * weight[:, None]).sum(0) / weight.sum()
     # L1 alone leaves the short translations and small turns of hand-held cameras unlearnt.
-    direction = direction_error(out["pose"][..., -1, :3], batch["pose"][..., :3], MOVING)
-    axis = direction_error(out["pose"][..., -1, 3:6], batch["pose"][..., 3:6], TURNING)
-    loss = depth + 0.4 * relative + 0.5 * gradient + 0.12 * confidence + 10 * shift + 20 * turn + 0.7 * view
-    return loss + 0.5 * direction + 0.8 * axis, {
-        "direction": direction, "axis": axis, "depth": depth, "relative": relative, "gradient": gradient,
-        "confidence": confidence, "shift": shift, "turn": turn, "view": view}
+    said = said[:, :, -1]
+    turned = 2 * (F.normalize(said[:, 1:, 3:7], dim=-1) - true[:, 1:, 3:7]).norm(dim=-1)
+    headed = directions_apart(said[..., :3], true[..., :3], MOVING)
+    return {"shift": off[:3].mean(), "turn": off[3:7].mean(), "view": off[7:].mean(),
+            "direction": direction_error(said[..., :3], true[..., :3], MOVING),
+            "axis": direction_error(said[..., 3:6], true[..., 3:6], TURNING),
+            "turned": typical(turned.flatten(), USUAL_TURN), "headed": typical(headed, USUAL_DIRECTION)}
+
+
+def objective(out, batch, dense=None):
+    """The loss and its terms. dense: the pictures out["depth"] is of, as in StreamVggt.clips."""
+    terms = {**depth_terms(out, batch, dense), **camera_terms(out, batch)}
+    return sum(WEIGHTS[name] * term for name, term in terms.items()), terms
 
 
 def write_safetensors(path, tensors, metadata):
