@@ -224,11 +224,13 @@ def main():
                            "this --config: its averaged weights and its readings")
     arguments.add_argument("--trained-rate", type=float, default=1, help="learning rate of weights from --start-from, in parts of "
                            "that of blocks that --config has more")
-    arguments.add_argument("--depth-part", type=float, default=0.25, help="frames of a clip that the depth head learns from in "
-                           "a step, a part of them")
+    arguments.add_argument("--depth-part", type=float, default=0.25, help="how much of a clip's frames the depth head learns "
+                           "from in a step, above 0 and at most 1")
     arguments.add_argument("--save-minutes", type=float, default=3)
     arguments.add_argument("--score-every", type=int, default=500)
     args = arguments.parse_args()
+    if not 0 < args.depth_part <= 1:
+        arguments.error(f"--depth-part: {args.depth_part} is not above 0 and at most 1")
     if any(name not in os.environ for name in TUNED):  # they are read when a process starts
         os.execve(sys.executable, [sys.executable, "-u", *sys.argv], {**TUNED, **os.environ})
     torch.set_num_threads(args.threads)
