@@ -42,7 +42,7 @@ def main():
         parts.append(f'<path d="M {x:.1f} {MARGIN} V {HEIGHT - MARGIN}" stroke="#999" stroke-dasharray="4 4"/>')
     parts += [path(trained, "#9bc", x_end, y_end, 1), path(held_out, "#c33", x_end, y_end, 2) if held_out else "",
               text(MARGIN, HEIGHT - MARGIN + 16, "0"), text(WIDTH - MARGIN, HEIGHT - MARGIN + 16, f"{x_end} steps"),
-              text(WIDTH / 2, 24, "mean |log depth error|"), text(WIDTH - MARGIN, 24, "in training", "end", "#69a"),
+              text(WIDTH / 2, 24, "mean |log depth error|"), text(WIDTH - MARGIN, 24, "in training, as the loss weighs it", "end", "#69a"),
               text(WIDTH - MARGIN, 40, "unseen scenes, averaged weights", "end", "#c33"), "</svg>"]
     open(sys.argv[2], "w").write("\n".join(parts) + "\n")
 

@@ -47,9 +47,10 @@ def targets(batch, step):
     and which of them moved."""
     points, objects = cells(batch["points"].permute(0, 1, 4, 2, 3), step).permute(0, 1, 3, 4, 2), batch["objects"]
     tangent = (batch["pose"][:, 0, 7:9] / 2).tan().flip(-1)
+    still = ~(batch["held"] | batch["person"])
     rotation, translation = batch["rotation"].float(), batch["translation"].float()
     found = [seen_in(points[:, s], batch["depth"][:, f], objects[:, f], cells(objects[:, s], step),
-                     cells(batch["still"][:, s], step), rotation[:, f], translation[:, f], tangent)
+                     cells(still[:, s], step), rotation[:, f], translation[:, f], tangent)
              for s in range(1, points.shape[1]) for f in (0, s - 1)]
     B, S = points.shape[:2]
     return [torch.stack(parts, 1).view(B, S - 1, 2, *parts[0].shape[1:]) for parts in zip(*found)]

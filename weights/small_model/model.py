@@ -25,10 +25,10 @@ DEFAULTS = {
     "dpt_pos_embed_ratio": 0.1, "image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
 POSE_DISCOUNT = 0.6  # of an earlier iteration's error
 USUAL_TURN, USUAL_DIRECTION = 0.0175, 0.175  # a good camera's errors, radians
-HELD_WEIGHT = 4.0    # of the depth of what is held and of people
+HELD_WEIGHT = 3.0    # of the depth of what is held and of people
 MOVING = 0.03        # of the mean distance: a translation that has a direction
 TURNING = 0.01       # sine of half the angle: a rotation that has an axis
-WEIGHTS = {"depth": 1, "relative": 0.6, "gradient": 0.7, "confidence": 0.2, "shift": 10, "turn": 20, "view": 0.7,
+WEIGHTS = {"depth": 1, "relative": 0.6, "gradient": 0.7, "grip": 0.7, "confidence": 0.2, "shift": 10, "turn": 20, "view": 0.7,
            "direction": 0.5, "axis": 0.8, "turned": 0.3, "headed": 0.15}  # of the objective's terms
 
 
@@ -95,14 +95,34 @@ def deepened(weights, pairs):
     return out, new
 
 
-def gradient_error(error):
-    """How unevenly the error lies: between neighbours, and between a hand and what it holds."""
+def gradient_error(error, worth):
+    """How unevenly the error lies: between neighbours, and between a hand and what it holds. A pair of pixels counts as much
+    as the worthier of them."""
     total, steps = 0, (1, 2, 4, 8, 16, 32)
     for step in steps:
         n = min(step, 4)
-        e = error[..., ::step // n, ::step // n]
-        total = total + (e[..., n:] - e[..., :-n]).abs().mean() + (e[..., n:, :] - e[..., :-n, :]).abs().mean()
+        e, w = (x[..., ::step // n, ::step // n] for x in (error, worth))
+        for side in (-1, -2):
+            size = e.shape[side] - n
+            pair = torch.maximum(w.narrow(side, 0, size), w.narrow(side, n, size))
+            apart = (e.narrow(side, n, size) - e.narrow(side, 0, size)).abs()
+            total = total + (pair * apart).mean() / pair.mean()
     return total / len(steps)
+
+
+def grip_error(error, objects, held, person):
+    """How differently far a held thing and the arm that holds it, the object numbered after it, are taken to be. error, objects'
+    numbers and masks, all [N, H, W]; mean over the pairs that fill a hundredth of a picture each."""
+    pictures, ids = len(error), int(objects.max()) + 2
+    place = (objects + ids * torch.arange(pictures)[:, None, None]).flatten()
+
+    def sums(values):
+        return torch.zeros(pictures * ids).scatter_add(0, place, values.flatten().float()).view(pictures, ids)
+
+    size = sums(torch.ones_like(error))
+    mean, large = sums(error) / size.clamp(min=1), size > 0.01 * error[0].numel()
+    pairs = (large & (sums(held) > 0))[:, :-1] & (large & (sums(person) > 0))[:, 1:]
+    return (mean[:, :-1] - mean[:, 1:]).abs()[pairs].sum() / pairs.sum().clamp(min=1)
 
 
 def direction_error(said, wanted, shortest):
@@ -124,17 +144,21 @@ def directions_apart(said, wanted, shortest):
 
 
 def depth_terms(out, batch, dense):
-    truth, still = (batch[k] if dense is None else batch[k].flatten(0, 1)[dense] for k in ("depth", "still"))
-    error = out["depth"].log() - truth.log()
+    def of(name):
+        return batch[name] if dense is None else batch[name].flatten(0, 1)[dense]
+
+    error = out["depth"].log() - of("depth").log()
     absolute = error.abs()
     # What is held and people are small in most pictures, and what they are looked at for.
-    worth = torch.where(still, 1.0, HELD_WEIGHT)
+    worth = torch.where(of("held") | of("person"), HELD_WEIGHT, 1.0)
     worth = worth / worth.mean()
     # What is taken for far though it is near weighs more than its logarithm says.
     relative = error.clamp(max=1.1).expm1().abs()
     # Its best value is 1 / error; it learns from the error and does not weigh it.
     confidence = out["confidence"] * absolute.detach() - out["confidence"].log()
-    return {"depth": (worth * absolute).mean(), "relative": (worth * relative).mean(), "gradient": gradient_error(error),
+    masks = (of(name).flatten(0, -3) for name in ("objects", "held", "person"))
+    return {"depth": (worth * absolute).mean(), "relative": (worth * relative).mean(),
+            "gradient": gradient_error(error, worth), "grip": grip_error(error.flatten(0, -3), *masks),
             "confidence": confidence.mean()}
 
 

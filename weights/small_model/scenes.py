@@ -102,7 +102,7 @@ class Batches:
 def targets(clips):
     """A list of clips as arrays: images [B,S,3,H,W] in [0,1]; depth [B,S,H,W] and cameras with the first
     frame's mean distance as unit and its camera as world; pose encodings [B,S,9]; points [B,S,H,W,3] in
-    the first camera; objects [B,S,H,W], and `still`: neither held nor a person; unit [B], metres."""
+    the first camera; objects [B,S,H,W] and masks of what is held and of people; unit [B], metres."""
     images = np.stack([c.rgb for c in clips]).astype(np.float32) / 255
     depth = np.stack([c.depth for c in clips])
     B, S, H, W = depth.shape
@@ -121,9 +121,11 @@ def targets(clips):
     in_camera = rays[:, None] * depth[..., None] - moved[:, :, None, None].astype(np.float32)
     points = np.einsum("bsji,bshwj->bshwi", relative.astype(np.float32), in_camera)
     encoding = np.concatenate([moved, quaternions(relative), np.broadcast_to(fov[:, None], (B, S, 2))], -1)
-    still = np.stack([(c.labels < LABELS.index("held"))[c.objects] for c in clips])
+    objects = np.stack([c.objects for c in clips]).astype(np.int64)
+    labels = np.stack([c.labels[c.objects] for c in clips])
+    held, person = (labels == LABELS.index(name) for name in ("held", "person"))
     return {"images": images.transpose(0, 1, 4, 2, 3), "depth": depth, "pose": encoding.astype(np.float32),
-            "points": points, "objects": np.stack([c.objects for c in clips]), "still": still, "unit": unit,
+            "points": points, "objects": objects, "held": held, "person": person, "unit": unit,
             "rotation": relative, "translation": moved, "fov": fov}
 
 
