@@ -25,11 +25,11 @@ DEFAULTS = {
     "dpt_pos_embed_ratio": 0.1, "image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
 POSE_DISCOUNT = 0.6  # of an earlier iteration's error
 USUAL_TURN, USUAL_DIRECTION = 0.0175, 0.175  # a good camera's errors, radians
-HELD_WEIGHT = 3.0    # of the depth of what is held and of people
+HELD_WEIGHT = 2.0    # of the depth of what is held and of people
 MOVING = 0.03        # of the mean distance: a translation that has a direction
 TURNING = 0.01       # sine of half the angle: a rotation that has an axis
 WEIGHTS = {"depth": 1, "relative": 0.6, "gradient": 0.7, "grip": 0.7, "confidence": 0.2, "shift": 10, "turn": 20, "view": 0.7,
-           "direction": 0.5, "axis": 0.8, "turned": 0.3, "headed": 0.15}  # of the objective's terms
+           "direction": 0.5, "axis": 0.8, "turned": 0.5, "headed": 0.15}  # of the objective's terms
 
 
 def load_config(path=HERE / "config.json"):

@@ -101,11 +101,14 @@ class Run:
             self.model.load_state_dict(weights)
             self.average.load_state_dict(weights)
             parts = {name: args.trained_rate for name in weights if name not in new}
-        matrices = {name: p for name, p in self.model.named_parameters() if has_muon(name, p)}
+        self.whole = not args.learn
+        for name, p in self.model.named_parameters():
+            p.requires_grad_(self.whole or name.startswith(tuple(args.learn)))
+        matrices = {name: p for name, p in self.model.named_parameters() if self.whole and has_muon(name, p)}
         self.muon = Muon(matrices, parts)
         groups = {}
         for name, p in [*self.model.named_parameters(), *self.helper.named_parameters()]:
-            if name not in matrices:
+            if name not in matrices and p.requires_grad:
                 groups.setdefault((p.ndim > 1, parts.get(name, 1)), []).append(p)
         self.optimiser = torch.optim.AdamW([{"params": ps, "weight_decay": 0.02 * matrix, "part": part}
                                             for (matrix, part), ps in groups.items()], lr=0, betas=(0.9, 0.98), foreach=True)
@@ -149,11 +152,14 @@ class Run:
         dense = torch.cat([b * S + torch.randperm(S)[:math.ceil(S * self.depth_part)] for b in range(B)])
         out = self.model.clips(batch["images"], self.bf16, dense)
         loss, terms = small.objective(out, batch, dense)
-        terms["helper"], terms["back"] = self.helper.loss(out["blocks"], batch)
-        terms["matching"], terms["matched"] = matching.loss(self.model, batch, 1 + self.config["num_register_tokens"])
+        learnt = loss
+        if self.whole:
+            terms["helper"], terms["back"] = self.helper.loss(out["blocks"], batch)
+            terms["matching"], terms["matched"] = matching.loss(self.model, batch, 1 + self.config["num_register_tokens"])
+            learnt = loss + 0.6 * terms["helper"] + 0.12 * terms["matching"]
         self.model.zero_grad(set_to_none=True)
         self.helper.zero_grad(set_to_none=True)
-        (loss + 0.6 * terms["helper"] + 0.12 * terms["matching"]).backward()
+        learnt.backward()
         # Apart, because the camera head's iterations make its gradients far larger.
         norm = torch.nn.utils.clip_grad_norm_(self.dense, 1.0)
         norm = norm + torch.nn.utils.clip_grad_norm_(self.model.camera_head.parameters(), 1.0)
@@ -224,6 +230,8 @@ def main():
                            "this --config: its averaged weights and its readings")
     arguments.add_argument("--trained-rate", type=float, default=1, help="learning rate of weights from --start-from, in parts of "
                            "that of blocks that --config has more")
+    arguments.add_argument("--learn", nargs="+", default=[], choices=("camera_head", "depth_head"), help="only these, by AdamW, on "
+                           "tokens that stay as they are; everything if not given")
     arguments.add_argument("--depth-part", type=float, default=0.25, help="how much of a clip's frames the depth head learns "
                            "from in a step, above 0 and at most 1")
     arguments.add_argument("--save-minutes", type=float, default=3)
