@@ -8,6 +8,7 @@ The shares add up to 1. OUT.pt goes where a checkpoint goes in evaluate.py, expo
 readings and the count of steps in it are the last one's.
 """
 import os
+import pickle
 import sys
 
 import torch
@@ -17,7 +18,7 @@ def weighted(argument):
     share, _, path = argument.partition("=")
     try:
         return float(share), path, torch.load(path)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RuntimeError, pickle.UnpicklingError) as error:
         sys.exit(f"mean.py: {argument}: not SHARE=CHECKPOINT: {error}")
 
 

@@ -222,7 +222,7 @@ def main():
     arguments.add_argument("run")
     arguments.add_argument("--stage", action="append", required=True)
     arguments.add_argument("--config", default=str(small.HERE / "config.json"))
-    arguments.add_argument("--seed", type=int, choices=range(1, 9), default=1, help="of the first weights and of the scenes, 1 to 8")
+    arguments.add_argument("--seed", type=int, choices=range(1, 10), default=1, help="of the first weights and of the scenes, 1 to 9")
     arguments.add_argument("--threads", type=int, default=2)
     arguments.add_argument("--bf16", action="store_true", help="products in bfloat16: faster on a CPU with AVX512_BF16")
     arguments.add_argument("--resume", action="store_true")

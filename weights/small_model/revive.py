@@ -1,0 +1,80 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: Apache-2.0
+"""Gives the two coarsest levels of the depth head, those of the third and the last tap, a new start.
+
+  revive.py CHECKPOINT.pt OUT.pt
+
+A level's sum passes a ReLU on its way. Where all of it is negative the level gives a constant, has no gradient and
+never comes back: the head then sees the first two taps only. Both levels start again from random weights, but give the
+constant they gave until they learn more. The share of values above 0 is printed, before and after, for random tokens.
+"""
+import os
+import pickle
+import sys
+
+import torch
+
+import model as small
+
+
+def start_again(convolution, gain):
+    with torch.no_grad():
+        convolution.weight.normal_(0, gain / convolution.weight[0].numel() ** 0.5)
+        if convolution.bias is not None:
+            convolution.bias.zero_()
+
+
+def revive(head):
+    scratch = head.scratch
+    last, features = scratch.refinenet3, scratch.refinenet3.out_conv.in_channels
+    with torch.no_grad():
+        constant = last.out_conv(last.resConfUnit2(torch.zeros(1, features, 13, 13)))[0, :, 6, 6].clone()
+    for level, layer in ((2, scratch.layer3_rn), (3, scratch.layer4_rn)):
+        start_again(head.projects[level], 1)
+        start_again(layer, 1)
+    start_again(head.resize_layers[3], 1)
+    for fusion in (scratch.refinenet3, scratch.refinenet4):
+        for unit in ("resConfUnit1", "resConfUnit2"):
+            if hasattr(fusion, unit):  # the coarsest has nothing coarser to add to
+                start_again(getattr(fusion, unit).conv1, 1.4)
+                start_again(getattr(fusion, unit).conv2, 0.5)
+        start_again(fusion.out_conv, 1)
+    with torch.no_grad():
+        last.out_conv.weight.zero_()
+        last.out_conv.bias.copy_(constant)
+
+
+def alive(head):
+    """Of every level's sum, the share above 0: what the rest of the head can see of it."""
+    shares, hooks = {}, []
+    for level in (1, 2, 3, 4):
+        unit = getattr(head.scratch, f"refinenet{level}").resConfUnit2
+        hooks.append(unit.register_forward_pre_hook(
+            lambda _, x, level=level: shares.__setitem__(level, (x[0] > 0).float().mean().item())))
+    with torch.no_grad():
+        head([torch.randn(2, 12 * 17, head.norm.normalized_shape[0]) for _ in range(4)], 12, 17, (168, 238))
+    for hook in hooks:
+        hook.remove()
+    return ", ".join(f"level {level} {shares[level]:.3f}" for level in sorted(shares))
+
+
+def main():
+    if len(sys.argv) != 3 or sys.argv[1] in ("-h", "--help"):
+        sys.exit(__doc__)
+    try:
+        state = torch.load(sys.argv[1])
+        model = small.make_model(small.load_config(), 0)
+        model.load_state_dict(state["average"])
+    except (OSError, KeyError, RuntimeError, pickle.UnpicklingError) as error:
+        sys.exit(f"revive.py: {sys.argv[1]}: not a checkpoint of train.py with config.json's sizes: {error}")
+    print("before:", alive(model.depth_head))
+    torch.manual_seed(5)
+    revive(model.depth_head)
+    print("after: ", alive(model.depth_head))
+    kept = {name: state[name] for name in ("helper", "total") if name in state}
+    torch.save({"average": model.state_dict(), **kept}, f"{sys.argv[2]}.tmp")
+    os.replace(f"{sys.argv[2]}.tmp", sys.argv[2])
+
+
+if __name__ == "__main__":
+    main()
