@@ -6,7 +6,8 @@
 
 A level's sum passes a ReLU on its way. Where all of it is negative the level gives a constant, has no gradient and
 never comes back: the head then sees the first two taps only. Both levels start again from random weights, but give the
-constant they gave until they learn more. The share of values above 0 is printed, before and after, for random tokens.
+constant they gave (away from the borders) until they learn more. The share of values above 0 is printed, before and
+after, on six rendered clips.
 """
 import os
 import pickle
@@ -14,7 +15,9 @@ import sys
 
 import torch
 
-import model as small
+import evaluate
+import scenes
+import train
 
 
 def start_again(convolution, gain):
@@ -44,15 +47,14 @@ def revive(head):
         last.out_conv.bias.copy_(constant)
 
 
-def alive(head):
+def alive(model, images):
     """Of every level's sum, the share above 0: what the rest of the head can see of it."""
     shares, hooks = {}, []
     for level in (1, 2, 3, 4):
-        unit = getattr(head.scratch, f"refinenet{level}").resConfUnit2
+        unit = getattr(model.depth_head.scratch, f"refinenet{level}").resConfUnit2
         hooks.append(unit.register_forward_pre_hook(
             lambda _, x, level=level: shares.__setitem__(level, (x[0] > 0).float().mean().item())))
-    with torch.no_grad():
-        head([torch.randn(2, 12 * 17, head.norm.normalized_shape[0]) for _ in range(4)], 12, 17, (168, 238))
+    evaluate.run_clips(model, images)
     for hook in hooks:
         hook.remove()
     return ", ".join(f"level {level} {shares[level]:.3f}" for level in sorted(shares))
@@ -62,15 +64,15 @@ def main():
     if len(sys.argv) != 3 or sys.argv[1] in ("-h", "--help"):
         sys.exit(__doc__)
     try:
-        state = torch.load(sys.argv[1])
-        model = small.make_model(small.load_config(), 0)
-        model.load_state_dict(state["average"])
+        state, model = torch.load(sys.argv[1]), evaluate.load(sys.argv[1])
     except (OSError, KeyError, RuntimeError, pickle.UnpicklingError) as error:
         sys.exit(f"revive.py: {sys.argv[1]}: not a checkpoint of train.py with config.json's sizes: {error}")
-    print("before:", alive(model.depth_head))
+    generator = scenes.Generator()
+    images = scenes.targets([generator.clip(train.HELD_OUT_SEED + i, 2, 168, 238) for i in range(6)])["images"]
+    print("before:", alive(model, images))
     torch.manual_seed(5)
     revive(model.depth_head)
-    print("after: ", alive(model.depth_head))
+    print("after: ", alive(model, images))
     kept = {name: state[name] for name in ("helper", "total") if name in state}
     torch.save({"average": model.state_dict(), **kept}, f"{sys.argv[2]}.tmp")
     os.replace(f"{sys.argv[2]}.tmp", sys.argv[2])
