@@ -43,6 +43,20 @@ def run_clips(model, images):
     return out["depth"].numpy(), out["confidence"].numpy(), out["pose"][:, :, -1].double().numpy()
 
 
+def depth_levels(model, images):
+    """Of every level's sum in the depth head, from the finest on, the share above 0: what the rest of the head can see of it.
+    A level where it stays 0 gives a constant and learns nothing."""
+    shares, hooks = [0.0] * 4, []
+    for level in range(4):
+        unit = getattr(model.depth_head.scratch, f"refinenet{level + 1}").resConfUnit2
+        hooks.append(unit.register_forward_pre_hook(
+            lambda _, x, level=level: shares.__setitem__(level, (x[0] > 0).float().mean().item())))
+    run_clips(model, images)
+    for hook in hooks:
+        hook.remove()
+    return shares
+
+
 def score_rendered(model, generator, seed, clips, frames, height, width):
     log_error, fitted, relative, most, constant = [], [], [], [], []
     turn, direction, still, view = [], [], [], []

@@ -48,16 +48,7 @@ def revive(head):
 
 
 def alive(model, images):
-    """Of every level's sum, the share above 0: what the rest of the head can see of it."""
-    shares, hooks = {}, []
-    for level in (1, 2, 3, 4):
-        unit = getattr(model.depth_head.scratch, f"refinenet{level}").resConfUnit2
-        hooks.append(unit.register_forward_pre_hook(
-            lambda _, x, level=level: shares.__setitem__(level, (x[0] > 0).float().mean().item())))
-    evaluate.run_clips(model, images)
-    for hook in hooks:
-        hook.remove()
-    return ", ".join(f"level {level} {shares[level]:.3f}" for level in sorted(shares))
+    return ", ".join(f"level {k} {share:.3f}" for k, share in enumerate(evaluate.depth_levels(model, images), 1))
 
 
 def main():

@@ -177,7 +177,14 @@ class Run:
 
     def score(self, stage, generator):
         scores = evaluate.score_rendered(self.average, generator, HELD_OUT_SEED, 32, 4, stage.height, stage.width)
-        self.say(step=self.total, stage=self.stage, held_out={k: round(v, 4) for k, v in scores.items()})
+        images = scenes.targets([generator.clip(HELD_OUT_SEED + i, 2, stage.height, stage.width) for i in range(6)])["images"]
+        levels = evaluate.depth_levels(self.average, images)
+        self.say(step=self.total, stage=self.stage, held_out={k: round(v, 4) for k, v in scores.items()},
+                 depth_levels=[round(share, 3) for share in levels])
+        for level, share in enumerate(levels, 1):
+            if share < 0.02:
+                print(f"train.py: the depth head's level {level} is above 0 in {100 * share:.1f} % of its values only and learns "
+                      "next to nothing; revive.py gives a dead level a new start", file=sys.stderr, flush=True)
 
     def run_stage(self, stage, generator):
         """To its end, or until asked to stop."""
