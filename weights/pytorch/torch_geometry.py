@@ -280,7 +280,7 @@ class StreamVggt(nn.Module):
         stream, depth and confidence [B, S, H, W], and what every pair of blocks gave, [B, S, P, 2C] each. bf16:
         products of the aggregator and the depth head in bfloat16, for training on a CPU that has them.
         dense: the pictures b * S + s to give depth for, all of them if None; depth and confidence are then
-        [n, H, W]."""
+        [n, H, W], empty for none."""
         c, (B, S, _, H, W) = self.c, images.shape
         h, w, special = H // c["patch_size"], W // c["patch_size"], 1 + c["num_register_tokens"]
         head_dim = c["embed_dim"] // c["agg_heads"]
@@ -293,6 +293,9 @@ class StreamVggt(nn.Module):
         poses = [torch.cat(self.camera_head(outputs[-1][:, s, :1], caches), 1) for s in range(S)]
         taps = [outputs[i][:, :, special:].flatten(0, 1) for i in c["taps"]]
         shape = (B, S, H, W) if dense is None else (len(dense), H, W)
+        if 0 in shape:
+            nothing = images.new_empty(shape)
+            return {"pose": torch.stack(poses, 1), "depth": nothing, "confidence": nothing, "blocks": outputs}
         with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
             depth, confidence = self.depth_head(taps if dense is None else [x[dense] for x in taps], h, w, (H, W))
         return {"pose": torch.stack(poses, 1), "depth": depth.view(shape), "confidence": confidence.view(shape),

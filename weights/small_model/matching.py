@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Teaches the global blocks where to look: what a patch of a later frame shows was somewhere in the first frame and in
-the frame before, and the renderer knows where. Two heads of each block but the last learn to attend there. Without it
+the frame before, and the renderer knows where. Two heads of each learning block but the last learn to attend there. Without it
 small models learn depth from single pictures and never compare frames; their cameras then have no direction."""
 import torch
 import torch.nn.functional as F
@@ -10,7 +10,8 @@ ALIKE = 0.06  # of log depth: the same surface
 
 def watch(model):
     for block in model.aggregator.global_blocks[:-1]:
-        block.attn.kept = []
+        if any(p.requires_grad for p in block.attn.parameters()):
+            block.attn.kept = []
 
 
 def cells(x, step):
@@ -60,8 +61,9 @@ def loss(model, batch, special):
     """Cross-entropy of the two heads' attention, mean over the patches that are in sight; and how many of those that moved
     are looked for in the right place by the last of them."""
     S, step = batch["depth"].shape[1], model.c["patch_size"]
-    seen = [[x[:, :2].float() for x in block.attn.kept.pop()] for block in model.aggregator.global_blocks[:-1]]
-    if S == 1:
+    kept = [block.attn.kept for block in model.aggregator.global_blocks if block.attn.kept is not None]
+    seen = [[x[:, :2].float() for x in pairs.pop()] for pairs in kept]
+    if S == 1 or not seen:
         return torch.zeros(()), torch.zeros(())
     wanted, moved = targets(batch, step)
     N = wanted.shape[-1]

@@ -29,7 +29,7 @@ HELD_WEIGHT = 2.0    # of the depth of what is held and of people
 MOVING = 0.03        # of the mean distance: a translation that has a direction
 TURNING = 0.01       # sine of half the angle: a rotation that has an axis
 WEIGHTS = {"depth": 1, "relative": 0.6, "gradient": 0.7, "grip": 0.7, "confidence": 0.2, "shift": 10, "turn": 20, "view": 0.7,
-           "direction": 0.5, "axis": 0.8, "turned": 0.5, "headed": 0.15}  # of the objective's terms
+           "direction": 0.5, "axis": 0.8, "turned": 2.0, "headed": 0.15}  # of the objective's terms
 
 
 def load_config(path=HERE / "config.json"):
@@ -177,8 +177,9 @@ def camera_terms(out, batch):
 
 
 def objective(out, batch, dense=None):
-    """The loss and its terms. dense: the pictures out["depth"] is of, as in StreamVggt.clips."""
-    terms = {**depth_terms(out, batch, dense), **camera_terms(out, batch)}
+    """The loss and its terms. dense: the pictures out["depth"] is of, as in StreamVggt.clips; none: cameras alone."""
+    depth = depth_terms(out, batch, dense) if out["depth"].numel() else {}
+    terms = {**depth, **camera_terms(out, batch)}
     return sum(WEIGHTS[name] * term for name, term in terms.items()), terms
 
 

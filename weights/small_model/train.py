@@ -88,11 +88,9 @@ class Run:
         self.stages = [Stage(text) for text in args.stage]
         self.config = small.load_config(args.config)
         self.model = small.make_model(self.config, args.seed)
-        matching.watch(self.model)
         self.helper = Helper(self.config)
         self.helper.watch(self.model)
         self.average = small.make_model(self.config, args.seed)
-        self.dense = [*self.model.aggregator.parameters(), *self.model.depth_head.parameters()]
         parts = {}  # of weights that are trained already and learn at a part of the rate
         if args.start_from:
             weights, new = small.deepened(evaluate.load(args.start_from, args.config).state_dict(), self.config["agg_depth"])
@@ -101,10 +99,9 @@ class Run:
             self.model.load_state_dict(weights)
             self.average.load_state_dict(weights)
             parts = {name: args.trained_rate for name in weights if name not in new}
-        self.whole = not args.learn
-        for name, p in self.model.named_parameters():
-            p.requires_grad_(self.whole or name.startswith(tuple(args.learn)))
-        matrices = {name: p for name, p in self.model.named_parameters() if self.whole and has_muon(name, p)}
+        self.choose_learnt(args)
+        matching.watch(self.model)
+        matrices = {name: p for name, p in self.learnt.items() if has_muon(name, p)}
         self.muon = Muon(matrices, parts)
         groups = {}
         for name, p in [*self.model.named_parameters(), *self.helper.named_parameters()]:
@@ -120,6 +117,23 @@ class Run:
         elif (self.folder / "checkpoint.pt").exists():
             sys.exit(f"train.py: {self.folder} has a checkpoint; --resume continues it")
         (self.folder / "arguments.json").write_text(json.dumps(vars(args), indent=1))
+
+    def choose_learnt(self, args):
+        """Those weights that args.learn names, or all; the depth head's only where depth has a loss."""
+        for name in args.learn:
+            if not any(weight.startswith(name) for weight, _ in self.model.named_parameters()):
+                sys.exit(f"train.py: --learn: no weight's name begins with {name!r}, such as \"camera_head\" or "
+                         "\"aggregator.global_blocks.3.\"")
+        for name, p in self.model.named_parameters():
+            p.requires_grad_((not args.learn or name.startswith(tuple(args.learn)))
+                             and (args.depth_part > 0 or not name.startswith("depth_head.")))
+        self.learnt = {name: p for name, p in self.model.named_parameters() if p.requires_grad}
+        if not self.learnt:
+            sys.exit("train.py: --learn names the depth head only, and --depth-part 0 leaves it no loss")
+        # Apart, because the camera head's iterations make its gradients far larger.
+        self.cameras = [p for name, p in self.learnt.items() if name.startswith("camera_head.")]
+        self.dense = [p for name, p in self.learnt.items() if not name.startswith("camera_head.")]
+        self.tokens = any(name.startswith("aggregator.") for name in self.learnt)
 
     def say(self, **entry):
         with open(self.folder / "log.jsonl", "a") as file:
@@ -153,16 +167,14 @@ class Run:
         out = self.model.clips(batch["images"], self.bf16, dense)
         loss, terms = small.objective(out, batch, dense)
         learnt = loss
-        if self.whole:
+        if self.tokens:
             terms["helper"], terms["back"] = self.helper.loss(out["blocks"], batch)
             terms["matching"], terms["matched"] = matching.loss(self.model, batch, 1 + self.config["num_register_tokens"])
             learnt = loss + 0.6 * terms["helper"] + 0.12 * terms["matching"]
         self.model.zero_grad(set_to_none=True)
         self.helper.zero_grad(set_to_none=True)
         learnt.backward()
-        # Apart, because the camera head's iterations make its gradients far larger.
-        norm = torch.nn.utils.clip_grad_norm_(self.dense, 1.0)
-        norm = norm + torch.nn.utils.clip_grad_norm_(self.model.camera_head.parameters(), 1.0)
+        norm = sum(torch.nn.utils.clip_grad_norm_(part, 1.0) for part in (self.dense, self.cameras) if part)
         if not math.isfinite(norm):
             raise RuntimeError(f"the gradient of step {self.total} is not finite")
         self.optimiser.step()
@@ -237,15 +249,15 @@ def main():
                            "this --config: its averaged weights and its readings")
     arguments.add_argument("--trained-rate", type=float, default=1, help="learning rate of weights from --start-from, in parts of "
                            "that of blocks that --config has more")
-    arguments.add_argument("--learn", nargs="+", default=[], choices=("camera_head", "depth_head"), help="only these, by AdamW, on "
-                           "tokens that stay as they are; everything if not given")
+    arguments.add_argument("--learn", nargs="+", default=[], metavar="NAME", help="only weights whose names begin so, such as "
+                           "camera_head or aggregator.global_blocks.3.; everything if not given")
     arguments.add_argument("--depth-part", type=float, default=0.25, help="how much of a clip's frames the depth head learns "
-                           "from in a step, above 0 and at most 1")
+                           "from in a step, 0 to 1; 0: cameras alone, the depth head stays as it is")
     arguments.add_argument("--save-minutes", type=float, default=3)
     arguments.add_argument("--score-every", type=int, default=500)
     args = arguments.parse_args()
-    if not 0 < args.depth_part <= 1:
-        arguments.error(f"--depth-part: {args.depth_part} is not above 0 and at most 1")
+    if not 0 <= args.depth_part <= 1:
+        arguments.error(f"--depth-part: {args.depth_part} is not in 0 to 1")
     if any(name not in os.environ for name in TUNED):  # they are read when a process starts
         os.execve(sys.executable, [sys.executable, "-u", *sys.argv], {**TUNED, **os.environ})
     torch.set_num_threads(args.threads)
