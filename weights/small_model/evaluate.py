@@ -7,7 +7,7 @@
 MODEL: a safetensors file with its configuration, or a training's checkpoint.pt (its averaged weights).
 Depth is scored in the unit the model was trained for, the first frame's mean distance, with no fitting; the
 lines "fitted" are after one scale a clip. Cameras: each later frame against the first; turn and direction are medians over
-those that moved by 3 % of the mean distance or more.
+those that moved by 3 % of the mean distance or more. Intervals: 95 % of what other clips of the same kind would give.
 """
 import argparse
 import json
@@ -57,6 +57,16 @@ def depth_levels(model, images):
     return shares
 
 
+def interval(of_clips, statistic):
+    """Where 95 % of the statistic's values lie when clips are drawn again from those at hand, as a list. of_clips: an array a clip."""
+    if not any(map(len, of_clips)):
+        return [math.nan, math.nan]
+    draw = np.random.default_rng(0)
+    drawn = (np.concatenate([of_clips[i] for i in draw.integers(0, len(of_clips), len(of_clips))]) for _ in range(500))
+    values = [statistic(values) for values in drawn if len(values)]
+    return [round(float(v), 4) for v in np.percentile(values, (2.5, 97.5))]
+
+
 def score_rendered(model, generator, seed, clips, frames, height, width):
     log_error, fitted, relative, most, constant = [], [], [], [], []
     turn, direction, still, view = [], [], [], []
@@ -81,10 +91,12 @@ def score_rendered(model, generator, seed, clips, frames, height, width):
         direction.append(np.degrees(np.arccos(np.clip(cosine, -1, 1)))[size > small.MOVING])
         off = angle_between(rotation_of(pose[:, 1:, 3:7]), truth["rotation"][:, 1:])
         moves = (size > small.MOVING).reshape(off.shape)
-        turn.append(off[moves])
+        turn.extend(o[m] for o, m in zip(off, moves))
         for s, at in enumerate(turn_at):
             at.extend(off[moves[:, s], s])
         still.append(np.linalg.norm(t, axis=-1)[size < 1e-6])
+    spread = {"abs_rel_interval": interval(np.concatenate(relative)[:, None], np.mean),
+              "rotation_degrees_interval": interval(turn, np.median)}
     log_error, turn, direction, still = map(np.concatenate, (log_error, turn, direction, still))
     return {"log_depth": float(log_error.mean()), "log_depth_median": float(np.median(log_error)),
             "log_depth_fitted": float(np.concatenate(fitted).mean()),
@@ -92,7 +104,7 @@ def score_rendered(model, generator, seed, clips, frames, height, width):
             "confident_half": float(np.mean(most)), "rotation_degrees": float(np.median(turn)) if len(turn) else math.nan,
             **{f"rotation_degrees_frame_{s}": float(np.median(at)) for s, at in enumerate(turn_at, 1) if at},
             "direction_degrees": float(np.median(direction)) if len(direction) else math.nan,
-            "moving": len(direction), "still_translation": float(np.median(still)) if len(still) else math.nan,
+            **spread, "moving": len(direction), "still_translation": float(np.median(still)) if len(still) else math.nan,
             "view_degrees": float(np.median(np.concatenate(view)))}
 
 

@@ -19,6 +19,7 @@ import signal
 import sys
 import time
 
+import numpy as np
 import torch
 
 import evaluate
@@ -191,7 +192,7 @@ class Run:
         scores = evaluate.score_rendered(self.average, generator, HELD_OUT_SEED, 32, 4, stage.height, stage.width)
         images = scenes.targets([generator.clip(HELD_OUT_SEED + i, 2, stage.height, stage.width) for i in range(6)])["images"]
         levels = evaluate.depth_levels(self.average, images)
-        self.say(step=self.total, stage=self.stage, held_out={k: round(v, 4) for k, v in scores.items()},
+        self.say(step=self.total, stage=self.stage, held_out={k: np.round(v, 4).tolist() for k, v in scores.items()},
                  depth_levels=[round(share, 3) for share in levels])
         for level, share in enumerate(levels, 1):
             if share < 0.02:
