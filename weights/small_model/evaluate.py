@@ -68,7 +68,7 @@ def interval(of_clips, statistic):
 
 
 def score_rendered(model, generator, seed, clips, frames, height, width):
-    log_error, fitted, relative, most, constant = [], [], [], [], []
+    log_error, fitted, relative, relative_fitted, most, constant = [], [], [], [], [], []
     turn, direction, still, view = [], [], [], []
     turn_at = [[] for _ in range(1, frames)]
     for first in range(0, clips, 8):
@@ -80,6 +80,7 @@ def score_rendered(model, generator, seed, clips, frames, height, width):
         log_error.append(np.abs(error).mean((1, 2, 3)))
         fitted.append(np.abs(error - scale).mean((1, 2, 3)))
         relative.append((np.abs(depth - truth["depth"]) / truth["depth"]).mean((1, 2, 3)))
+        relative_fitted.append((np.abs(depth / np.exp(scale) - truth["depth"]) / truth["depth"]).mean((1, 2, 3)))
         constant.append(np.abs(np.log(truth["depth"])).mean((1, 2, 3)))
         for e, c in zip(np.abs(error), confidence):
             for ef, cf in zip(e.reshape(frames, -1), c.reshape(frames, -1)):
@@ -100,7 +101,8 @@ def score_rendered(model, generator, seed, clips, frames, height, width):
     log_error, turn, direction, still = map(np.concatenate, (log_error, turn, direction, still))
     return {"log_depth": float(log_error.mean()), "log_depth_median": float(np.median(log_error)),
             "log_depth_fitted": float(np.concatenate(fitted).mean()),
-            "abs_rel": float(np.concatenate(relative).mean()), "constant_log_depth": float(np.concatenate(constant).mean()),
+            "abs_rel": float(np.concatenate(relative).mean()), "abs_rel_fitted": float(np.concatenate(relative_fitted).mean()),
+            "constant_log_depth": float(np.concatenate(constant).mean()),
             "confident_half": float(np.mean(most)), "rotation_degrees": float(np.median(turn)) if len(turn) else math.nan,
             **{f"rotation_degrees_frame_{s}": float(np.median(at)) for s, at in enumerate(turn_at, 1) if at},
             "direction_degrees": float(np.median(direction)) if len(direction) else math.nan,

@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gives the two coarsest levels of the depth head, those of the third and the last tap, a new start.
 
-  revive.py CHECKPOINT.pt OUT.pt
+  revive.py MODEL OUT.pt
+
+MODEL: a training's checkpoint.pt or a model's safetensors.
 
 A level's sum passes a ReLU on its way. Where all of it is negative the level gives a constant, has no gradient and
 never comes back: the head then sees the first two taps only. Both levels start again from random weights, but give the
@@ -55,9 +57,9 @@ def main():
     if len(sys.argv) != 3 or sys.argv[1] in ("-h", "--help"):
         sys.exit(__doc__)
     try:
-        state, model = torch.load(sys.argv[1]), evaluate.load(sys.argv[1])
-    except (OSError, KeyError, RuntimeError, pickle.UnpicklingError) as error:
-        sys.exit(f"revive.py: {sys.argv[1]}: not a checkpoint of train.py with config.json's sizes: {error}")
+        state, model = torch.load(sys.argv[1]) if sys.argv[1].endswith(".pt") else {}, evaluate.load(sys.argv[1])
+    except (OSError, KeyError, ValueError, RuntimeError, pickle.UnpicklingError) as error:
+        sys.exit(f"revive.py: {sys.argv[1]}: neither a checkpoint of train.py with config.json's sizes nor a model's safetensors: {error}")
     generator = scenes.Generator()
     images = scenes.targets([generator.clip(train.HELD_OUT_SEED + i, 2, 168, 238) for i in range(6)])["images"]
     print("before:", alive(model, images))

@@ -32,7 +32,6 @@ from muon import Muon
 TRAIN_SEED = 10_000_000      # batch k of stage s with --seed n: TRAIN_SEED * (10 (n - 1) + s + 1) + 64 k
 HELD_OUT_SEED = 900_000_000  # never trained on
 MUON_RATE = 3                # its learning rate beside AdamW's
-AVERAGE = 0.998              # of the running average of the weights
 # Memory stays with the process and threads sleep while they wait: a step takes half the time.
 TUNED = {"OMP_WAIT_POLICY": "passive", "OPENBLAS_THREAD_TIMEOUT": "4", "MALLOC_MMAP_MAX_": "0",
          "MALLOC_TRIM_THRESHOLD_": "20000000000"}
@@ -95,15 +94,16 @@ class Run:
         parts = {}  # of weights that are trained already and learn at a part of the rate
         if args.start_from:
             weights, new = small.deepened(evaluate.load(args.start_from, args.config).state_dict(), self.config["agg_depth"])
-            if args.start_from.endswith(".pt"):
-                self.helper.load_state_dict(torch.load(args.start_from)["helper"])
+            if args.start_from.endswith(".pt") and "helper" in (state := torch.load(args.start_from)):
+                self.helper.load_state_dict(state["helper"])
             self.model.load_state_dict(weights)
             self.average.load_state_dict(weights)
+            new |= {name for name in weights if name.startswith(tuple(args.new))}
             parts = {name: args.trained_rate for name in weights if name not in new}
         self.choose_learnt(args)
         matching.watch(self.model)
         matrices = {name: p for name, p in self.learnt.items() if has_muon(name, p)}
-        self.muon = Muon(matrices, parts)
+        self.muon = Muon(matrices, parts, args.momentum)
         groups = {}
         for name, p in [*self.model.named_parameters(), *self.helper.named_parameters()]:
             if name not in matrices and p.requires_grad:
@@ -112,6 +112,7 @@ class Run:
                                             for (matrix, part), ps in groups.items()], lr=0, betas=(0.9, 0.98), foreach=True)
         self.stage, self.step, self.total, self.spent, self.stop = 0, 0, 0, 0.0, False
         self.bf16, self.depth_part, self.first_scene = args.bf16, args.depth_part, TRAIN_SEED * (10 * (args.seed - 1) + 1)
+        self.decay = args.average
         self.save_every, self.score_every = 60 * args.save_minutes, args.score_every
         if args.resume:
             self.load()
@@ -121,9 +122,9 @@ class Run:
 
     def choose_learnt(self, args):
         """Those weights that args.learn names, or all; the depth head's only where depth has a loss."""
-        for name in args.learn:
+        for option, name in [("learn", name) for name in args.learn] + [("new", name) for name in args.new]:
             if not any(weight.startswith(name) for weight, _ in self.model.named_parameters()):
-                sys.exit(f"train.py: --learn: no weight's name begins with {name!r}, such as \"camera_head\" or "
+                sys.exit(f"train.py: --{option}: no weight's name begins with {name!r}, such as \"camera_head\" or "
                          "\"aggregator.global_blocks.3.\"")
         for name, p in self.model.named_parameters():
             p.requires_grad_((not args.learn or name.startswith(tuple(args.learn)))
@@ -181,7 +182,7 @@ class Run:
         self.optimiser.step()
         self.muon.step()
         self.total += 1
-        decay = min(AVERAGE, self.total / (self.total + 20))
+        decay = min(self.decay, self.total / (self.total + 20))
         with torch.no_grad():
             mean = list(self.average.parameters())
             torch._foreach_mul_(mean, decay)
@@ -249,7 +250,11 @@ def main():
     arguments.add_argument("--start-from", help="a model's safetensors, or another run's checkpoint with "
                            "this --config: its averaged weights and its readings")
     arguments.add_argument("--trained-rate", type=float, default=1, help="learning rate of weights from --start-from, in parts of "
-                           "that of blocks that --config has more")
+                           "that of blocks that --config has more and of what --new names")
+    arguments.add_argument("--new", nargs="+", default=[], metavar="NAME", help="weights whose names begin so learn as new ones "
+                           "though --start-from has them, such as those that revive.py started again")
+    arguments.add_argument("--average", type=float, default=0.998, help="decay of the weights' running average in a step")
+    arguments.add_argument("--momentum", type=float, default=0.95, help="of Muon")
     arguments.add_argument("--learn", nargs="+", default=[], metavar="NAME", help="only weights whose names begin so, such as "
                            "camera_head or aggregator.global_blocks.3.; everything if not given")
     arguments.add_argument("--depth-part", type=float, default=0.25, help="how much of a clip's frames the depth head learns "
@@ -259,6 +264,11 @@ def main():
     args = arguments.parse_args()
     if not 0 <= args.depth_part <= 1:
         arguments.error(f"--depth-part: {args.depth_part} is not in 0 to 1")
+    if args.new and not args.start_from:
+        arguments.error("--new: without --start-from everything is new")
+    for name in ("average", "momentum"):
+        if not 0 <= getattr(args, name) < 1:
+            arguments.error(f"--{name}: {getattr(args, name)} is not at least 0 and less than 1")
     if any(name not in os.environ for name in TUNED):  # they are read when a process starts
         os.execve(sys.executable, [sys.executable, "-u", *sys.argv], {**TUNED, **os.environ})
     torch.set_num_threads(args.threads)
