@@ -248,7 +248,7 @@ def main():
     arguments.add_argument("--bf16", action="store_true", help="products in bfloat16: faster on a CPU with AVX512_BF16")
     arguments.add_argument("--resume", action="store_true")
     arguments.add_argument("--start-from", help="a model's safetensors, or another run's checkpoint with "
-                           "this --config: its averaged weights and its readings")
+                           "this --config: its averaged weights, and its readings if it has them")
     arguments.add_argument("--trained-rate", type=float, default=1, help="learning rate of weights from --start-from, in parts of "
                            "that of blocks that --config has more and of what --new names")
     arguments.add_argument("--new", nargs="+", default=[], metavar="NAME", help="weights whose names begin so learn as new ones "
