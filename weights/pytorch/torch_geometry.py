@@ -60,6 +60,21 @@ class Rope2d:
         return t * self.cos + t.unflatten(-1, self.split).flip(-2).flatten(-3) * self.sin
 
 
+def frame_mask(frames, tokens):
+    """[N, N]: 0 where a token's frame may look, minus infinity at later frames."""
+    frame = torch.arange(frames).repeat_interleave(tokens)
+    return torch.zeros(len(frame), len(frame)).masked_fill(frame[:, None] < frame, -math.inf)
+
+
+def frame_attention(q, k, v, frame=None):
+    """q, k, v: [B, heads, N, d]; frame: so many tokens are one frame's, and see those of their own and of earlier
+    frames; all see all if None."""
+    scores = (q * q.shape[-1] ** -0.5) @ k.transpose(-2, -1)
+    if frame and frame < q.shape[2]:
+        scores = scores + frame_mask(q.shape[2] // frame, frame)
+    return torch.softmax(scores, -1) @ v
+
+
 class Attention(nn.Module):
     kept = None  # a list for a training that wants to see queries and keys
 
@@ -71,9 +86,8 @@ class Attention(nn.Module):
         self.k_norm = nn.LayerNorm(dim // heads, eps=1e-5) if qk_norm else nn.Identity()
         self.proj = nn.Linear(dim, dim)
 
-    def forward(self, x, rope=None, cache=None, mask=None):
-        """x: [B, N, C]; cache: list of earlier (k, v), to which this call adds its own; mask: [N, N],
-        added to the scores."""
+    def forward(self, x, rope=None, cache=None, frame=None):
+        """x: [B, N, C]; cache: list of earlier (k, v), to which this call adds its own; frame: as in frame_attention."""
         B, N, C = x.shape
         q, k, v = self.qkv(x).to(x.dtype).reshape(B, N, 3, self.heads, C // self.heads).permute(2, 0, 3, 1, 4)
         q, k = self.q_norm(q), self.k_norm(k)
@@ -84,9 +98,7 @@ class Attention(nn.Module):
         if cache is not None:
             cache.append((k, v))
             k, v = (torch.cat(parts, 2) for parts in zip(*cache))
-        scores = (q * q.shape[-1] ** -0.5) @ k.transpose(-2, -1)
-        weights = torch.softmax(scores if mask is None else scores + mask, -1)
-        return self.proj((weights @ v).transpose(1, 2).reshape(B, N, C))
+        return self.proj(frame_attention(q, k, v, frame).transpose(1, 2).reshape(B, N, C))
 
 
 class Block(nn.Module):
@@ -99,8 +111,8 @@ class Block(nn.Module):
         self.mlp = Mlp(dim, int(dim * mlp_ratio))
         self.ls2 = LayerScale(dim, init_values)
 
-    def forward(self, x, rope=None, cache=None, mask=None):
-        x = x + self.ls1(self.attn(self.norm1(x), rope, cache, mask))
+    def forward(self, x, rope=None, cache=None, frame=None):
+        x = x + self.ls1(self.attn(self.norm1(x), rope, cache, frame))
         return x + self.ls2(self.mlp(self.norm2(x)))
 
 
@@ -170,9 +182,9 @@ class Aggregator(nn.Module):
             outputs.append(torch.cat([within, x], -1))
         return outputs
 
-    def clips(self, images, rope, frames_rope, mask):
+    def clips(self, images, rope, frames_rope):
         """Whole clips, each frame seeing itself and those before. images: [B, S, 3, H, W];
-        frames_rope: of all S frames in a row; mask: frame_mask(S, P). Outputs [B, S, P, 2C]."""
+        frames_rope: of all S frames in a row. Outputs [B, S, P, 2C]."""
         B, S = images.shape[:2]
         mean = torch.tensor(self.c["image_mean"])[:, None, None]
         std = torch.tensor(self.c["image_std"])[:, None, None]
@@ -183,15 +195,9 @@ class Aggregator(nn.Module):
         outputs, P = [], x.shape[2]
         for frame_block, global_block in zip(self.frame_blocks, self.global_blocks):
             within = frame_block(x.flatten(0, 1), rope).view(B, S, P, -1)
-            x = global_block(within.flatten(1, 2), frames_rope, None, mask).view(B, S, P, -1)
+            x = global_block(within.flatten(1, 2), frames_rope, None, P).view(B, S, P, -1)
             outputs.append(torch.cat([within, x], -1))
         return outputs
-
-
-def frame_mask(frames, tokens):
-    """[N, N]: 0 where a token's frame may look, minus infinity at later frames."""
-    frame = torch.arange(frames).repeat_interleave(tokens)
-    return torch.zeros(len(frame), len(frame)).masked_fill(frame[:, None] < frame, -math.inf)
 
 
 class CameraHead(nn.Module):
@@ -287,7 +293,7 @@ class StreamVggt(nn.Module):
         rope = Rope2d(h, w, head_dim, c["rope_freq"], special)
         frames_rope = Rope2d(h, w, head_dim, c["rope_freq"], special, S)
         with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
-            outputs = self.aggregator.clips(images, rope, frames_rope, frame_mask(S, special + h * w))
+            outputs = self.aggregator.clips(images, rope, frames_rope)
         outputs = [x.float() for x in outputs]
         caches = [[] for _ in self.camera_head.trunk]
         poses = [torch.cat(self.camera_head(outputs[-1][:, s, :1], caches), 1) for s in range(S)]

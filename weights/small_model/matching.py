@@ -2,8 +2,12 @@
 """Teaches the global blocks where to look: what a patch of a later frame shows was somewhere in the first frame and in
 the frame before, and the renderer knows where. Two heads of each learning block but the last learn to attend there. Without it
 small models learn depth from single pictures and never compare frames; their cameras then have no direction."""
+import ctypes
+
 import torch
 import torch.nn.functional as F
+
+import attention
 
 ALIKE = 0.06  # of log depth: the same surface
 
@@ -57,26 +61,48 @@ def targets(batch, step):
     return [torch.stack(parts, 1).view(B, S - 1, 2, *parts[0].shape[1:]) for parts in zip(*found)]
 
 
+class Look(torch.autograd.Function):
+    """q, k: [B, 2, S * P, HEAD]. The cross-entropy's sum, by kernels/matching.cc; and how many are looked for in the right place."""
+    @staticmethod
+    def forward(ctx, q, k, wanted, moved, special):
+        (B, later), frame, (dq, dk) = wanted.shape[:2], q.shape[2] // (1 + wanted.shape[1]), map(torch.empty_like, (q, k))
+        found = (ctypes.c_double * 2)()
+        pointers = [ctypes.c_void_p(t.data_ptr()) for t in (q, k, dq, dk, wanted, moved)]
+        sizes = [ctypes.c_int64(n) for n in (B, 1 + later, frame, special, torch.get_num_threads())]
+        attention.library().small_model_matching(*pointers, *sizes, found)
+        ctx.save_for_backward(dq, dk)
+        right = torch.tensor(found[1])
+        ctx.mark_non_differentiable(right)
+        return torch.tensor(found[0], dtype=torch.float32), right
+
+    @staticmethod
+    def backward(ctx, given, _):
+        dq, dk = ctx.saved_tensors
+        return given * dq, given * dk, None, None, None
+
+
+def look(q, k, wanted, moved, special):
+    """What Look computes, in PyTorch."""
+    S, P, total, right = 1 + wanted.shape[1], special + wanted.shape[-1], 0, 0
+    for s in range(1, S):
+        scores = q[:, :, s * P + special:(s + 1) * P] @ k[:, :, :(s + 1) * P].transpose(-1, -2) * q.shape[-1] ** -0.5
+        log = scores.log_softmax(-1)
+        for head, frame in ((0, 0), (1, s - 1)):
+            at = log[:, head, :, frame * P + special:(frame + 1) * P]
+            total = total - (wanted[:, s - 1, head] * at).sum()
+            best = wanted[:, s - 1, head].gather(-1, at.argmax(-1, keepdim=True))[..., 0]
+            right = right + (moved[:, s - 1, head] & (best > 0)).sum()
+    return total, right
+
+
 def loss(model, batch, special):
     """Cross-entropy of the two heads' attention, mean over the patches that are in sight; and how many of those that moved
     are looked for in the right place by the last of them."""
-    S, step = batch["depth"].shape[1], model.c["patch_size"]
     kept = [block.attn.kept for block in model.aggregator.global_blocks if block.attn.kept is not None]
     seen = [[x[:, :2].float() for x in pairs.pop()] for pairs in kept]
-    if S == 1 or not seen:
+    if batch["depth"].shape[1] == 1 or not seen:
         return torch.zeros(()), torch.zeros(())
-    wanted, moved = targets(batch, step)
-    N = wanted.shape[-1]
-    P = special + N
-    total, sight, all_moved = 0, wanted.sum().clamp(min=1), moved.sum().clamp(min=1)
-    for q, k in seen:
-        right = 0
-        for s in range(1, S):
-            scores = q[:, :, s * P + special:(s + 1) * P] @ k[:, :, :(s + 1) * P].transpose(-1, -2) * q.shape[-1] ** -0.5
-            log = scores.log_softmax(-1)
-            for head, frame in ((0, 0), (1, s - 1)):
-                at = log[:, head, :, frame * P + special:(frame + 1) * P]
-                total = total - (wanted[:, s - 1, head] * at).sum()
-                best = wanted[:, s - 1, head].gather(-1, at.argmax(-1, keepdim=True))[..., 0]
-                right = right + (moved[:, s - 1, head] & (best > 0)).sum()
-    return total / sight / len(seen), right / all_moved
+    wanted, moved = targets(batch, model.c["patch_size"])
+    way = Look.apply if seen[0][0].shape[-1] == attention.HEAD else look
+    found = [way(*(x.contiguous() for x in pair), wanted, moved, special) for pair in seen]
+    return sum(total for total, _ in found) / wanted.sum().clamp(min=1) / len(seen), found[-1][1] / moved.sum().clamp(min=1)

@@ -18,29 +18,29 @@ import pictures
 
 HERE = pathlib.Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
+BUILD = ROOT / "build" / "small_model"
 LABELS = ("room", "thing", "held", "person")
 
 Clip = collections.namedtuple("Clip", "rgb depth objects cam_from_world fov labels seed")
 
 
-def build_library(folder):
-    """Compiles the generator, unless `folder` has it already newer than its sources."""
-    sources = sorted(HERE.glob("*.cc"))
-    target = pathlib.Path(folder) / "libsmall_model_scenes.so"
-    newest = max(p.stat().st_mtime for p in [*sources, *HERE.glob("*.h")])
+def build_library(name, sources, flags, folder=BUILD):
+    """Compiles the .cc files in the folder `sources`, unless `folder` has a library newer than they are."""
+    target = pathlib.Path(folder) / f"libsmall_model_{name}.so"
+    newest = max(p.stat().st_mtime for kind in ("*.cc", "*.h") for p in sources.glob(kind))
     if not target.exists() or target.stat().st_mtime < newest:
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as work:
             made = pathlib.Path(work) / target.name
-            subprocess.run([os.environ.get("CXX", "c++"), "-std=c++20", "-O3", "-fno-math-errno", "-fPIC", "-shared",
-                            f"-I{ROOT}", *map(str, sources), "-o", str(made)], check=True)
+            subprocess.run([os.environ.get("CXX", "c++"), "-std=c++20", "-O3", "-fno-math-errno", "-fPIC", "-shared", *flags,
+                            f"-I{ROOT}", *map(str, sorted(sources.glob("*.cc"))), "-o", str(made)], check=True)
             os.replace(made, target)
     return target
 
 
 class Generator:
-    def __init__(self, folder=ROOT / "build" / "small_model"):
-        self.render_clip = ctypes.CDLL(str(build_library(folder))).small_model_render
+    def __init__(self, folder=BUILD):
+        self.render_clip = ctypes.CDLL(str(build_library("scenes", HERE, [], folder))).small_model_render
         pointer = ctypes.c_void_p
         self.render_clip.argtypes = [ctypes.c_uint64, ctypes.c_int, ctypes.c_int, ctypes.c_int] + [pointer] * 6
         self.render_clip.restype = ctypes.c_int

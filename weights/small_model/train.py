@@ -22,6 +22,7 @@ import time
 import numpy as np
 import torch
 
+import attention
 import evaluate
 import matching
 import model as small
@@ -102,6 +103,7 @@ class Run:
             parts = {name: args.trained_rate for name in weights if name not in new}
         self.choose_learnt(args)
         matching.watch(self.model)
+        attention.use(self.model)
         matrices = {name: p for name, p in self.learnt.items() if has_muon(name, p)}
         self.muon = Muon(matrices, parts, args.momentum)
         groups = {}
@@ -184,9 +186,9 @@ class Run:
         self.total += 1
         decay = min(self.decay, self.total / (self.total + 20))
         with torch.no_grad():
-            mean = list(self.average.parameters())
+            mean = [p for name, p in self.average.named_parameters() if name in self.learnt]
             torch._foreach_mul_(mean, decay)
-            torch._foreach_add_(mean, list(self.model.parameters()), alpha=1 - decay)
+            torch._foreach_add_(mean, list(self.learnt.values()), alpha=1 - decay)
         return {**{k: float(v) for k, v in terms.items()}, "loss": float(loss), "norm": float(norm)}
 
     def score(self, stage, generator):
