@@ -11,6 +11,7 @@ included), log.jsonl (losses and scores), arguments.json.
 """
 import argparse
 import collections
+import concurrent.futures
 import json
 import math
 import os
@@ -29,13 +30,14 @@ import model as small
 import scenes
 from helper import Helper
 from muon import Muon
+from shared_layers import SharedLayers
 
 TRAIN_SEED = 10_000_000      # batch k of stage s with --seed n: TRAIN_SEED * (10 (n - 1) + s + 1) + 64 k
 HELD_OUT_SEED = 900_000_000  # never trained on
 MUON_RATE = 3                # its learning rate beside AdamW's
-# Memory stays with the process and threads sleep while they wait: a step takes half the time.
+# Memory stays with the process, in huge pages, and threads sleep while they wait: a step takes half the time.
 TUNED = {"OMP_WAIT_POLICY": "passive", "OPENBLAS_THREAD_TIMEOUT": "4", "MALLOC_MMAP_MAX_": "0",
-         "MALLOC_TRIM_THRESHOLD_": "20000000000"}
+         "MALLOC_TRIM_THRESHOLD_": "20000000000", "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
 
 
 class Stage:
@@ -104,6 +106,7 @@ class Run:
         self.choose_learnt(args)
         matching.watch(self.model)
         attention.use(self.model)
+        self.shared = SharedLayers(self.model.camera_head)
         matrices = {name: p for name, p in self.learnt.items() if has_muon(name, p)}
         self.muon = Muon(matrices, parts, args.momentum)
         groups = {}
@@ -160,8 +163,8 @@ class Run:
             getattr(self, name).load_state_dict(state[name])
         self.stage, self.step, self.total, self.spent = (state[k] for k in ("stage", "step", "total", "spent"))
 
-    def one_step(self, clips, rate):
-        batch = {k: torch.from_numpy(v) for k, v in scenes.targets(clips).items()}
+    def one_step(self, batch, rate):
+        batch = {k: torch.from_numpy(v) for k, v in batch.items()}
         for group in self.optimiser.param_groups:
             group["lr"] = rate * group["part"]
         self.muon.lr = MUON_RATE * rate
@@ -178,6 +181,7 @@ class Run:
         self.model.zero_grad(set_to_none=True)
         self.helper.zero_grad(set_to_none=True)
         learnt.backward()
+        self.shared.add_gradients()
         norm = sum(torch.nn.utils.clip_grad_norm_(part, 1.0) for part in (self.dense, self.cameras) if part)
         if not math.isfinite(norm):
             raise RuntimeError(f"the gradient of step {self.total} is not finite")
@@ -206,10 +210,16 @@ class Run:
         """To its end, or until asked to stop."""
         fresh = scenes.Batches(generator, stage.plan, self.first_scene + TRAIN_SEED * self.stage, self.step)
         recent, sums, begin, clock = Recent(len(stage.kinds)), {}, time.time(), time.time()
+
+        def batch(k):
+            return scenes.targets(recent.add_old(next(fresh), stage.kinds[k % len(stage.kinds)][0]))
+
+        ahead = concurrent.futures.ThreadPoolExecutor(1)
+        pending = ahead.submit(batch, self.step)
         while stage.done(self.step, self.spent) < 1 and not self.stop:
             rate = stage.learning_rate(self.step, stage.done(self.step, self.spent), stage is self.stages[-1])
-            clips = recent.add_old(next(fresh), stage.kinds[self.step % len(stage.kinds)][0])
-            for k, v in self.one_step(clips, rate).items():
+            now, pending = pending.result(), ahead.submit(batch, self.step + 1)
+            for k, v in self.one_step(now, rate).items():
                 sums.setdefault(k, []).append(v)
             self.step += 1
             if self.step % 20 == 0:
