@@ -29,7 +29,7 @@ annotated=$(grep -o '"file_name": *"[0-9]*' "$name/annotations/train/_annotation
 "$programs/examples/make_tokens" "$name" --max-past-frames 1 --out tokens --resume
 decoder=(--tokens tokens --config "$here/weights/small_model/config.json"
   --held-out-frames "$annotated" --batch 4 --schedule cosine --warmup-steps 10 --evaluate-every 100 --loss-cos 0.5 --resume)
-"$programs/examples/train_decoder" "$name" "${decoder[@]}" --out-channels 48 64 96 96 --seed 1 --steps 680 --learning-rate 2e-3 \
+"$programs/examples/train_decoder" "$name" "${decoder[@]}" --out-channels 48 64 96 96 --seed 3 --steps 680 --learning-rate 2e-3 \
   --ema 0.98 --output decoder
 "$programs/examples/train_decoder" "$name" "${decoder[@]}" --supervision dynamic --no-rgb --out-channels 32 64 96 96 --steps 500 \
   --learning-rate 2e-3 --output state_decoder

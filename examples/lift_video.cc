@@ -234,7 +234,8 @@ class SharedModel {
     if (!files_.checkpoint().all_f32()) say(files_.checkpoint().storage_summary());
     if (!options_.sha256.empty()) check_sha256(options_.weights.weights, options_.sha256);
     model_.emplace(LangVggt::load(options_.weights, ctx()));
-    for (const std::string& warning : model_->warnings()) say("warning: " + warning);
+    for (const std::string& warning : cli::load_warnings(*model_, options_.weights.weights))
+      say("warning: " + warning);
     if (!model_->has_decoder() && !model_->has_state_decoder())
       say("no decoder: geometry only, without semantics and RGB");
     return *model_;
@@ -285,7 +286,7 @@ int lift_one(const LiftOptions& options, SharedModel& shared, const cli::Interru
 
   Times times;
   const LangVggt& model = shared.get(times.load);
-  record.warnings = model.warnings();
+  record.warnings = cli::load_warnings(model, options.weights.weights);
   Lift run(options, input, files, model, record, times, interrupt, shared.ctx());
   try {
     run.run();

@@ -52,7 +52,8 @@ class Encoder {
     if (!aggregator_) {
       if (!checkpoint_.all_f32()) say(checkpoint_.storage_summary());
       aggregator_.emplace(load_aggregator(checkpoint_, ctx_));
-      for (const std::string& warning : checkpoint_.warnings()) say("warning: " + warning);
+      for (const std::string& warning : cli::load_warnings(checkpoint_, options_.weights.weights))
+        say("warning: " + warning);
     }
     return *aggregator_;
   }

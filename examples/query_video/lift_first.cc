@@ -50,7 +50,8 @@ void lift_first(const Options& o, const std::string& folder, const std::function
              lift_plan::breakdown(plan), ")"));
 
   const LangVggt model = LangVggt::load(lift.weights, ctx);
-  for (const std::string& warning : model.warnings()) say("warning: " + warning);
+  for (const std::string& warning : cli::load_warnings(model, lift.weights.weights))
+    say("warning: " + warning);
   prepare();
   cli::create_output_folder(folder);
   RunFormat format = lift_plan::run_format(lift, input, files, ctx);

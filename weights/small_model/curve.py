@@ -30,7 +30,7 @@ def main():
     for e in entries:
         if "stage" in e:
             stages.setdefault(e["stage"], e["step"])
-    x_end, y_end = max(x for x, _ in trained), 0.5
+    x_end, y_end = max(x for x, _ in trained + held_out), 0.5
     parts = [f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDTH}" height="{HEIGHT}">',
              f'<rect width="{WIDTH}" height="{HEIGHT}" fill="white"/>']
     for tenth in range(6):

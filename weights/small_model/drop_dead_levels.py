@@ -5,7 +5,8 @@
   drop_dead_levels.py MODEL.safetensors OUT.safetensors
 
 A level's sum passes a ReLU on its way. Where all of it is negative, the level gives a constant whatever its channels say.
-The two coarsest levels, those of the third and the last tap, get the fewest channels a configuration can have, all 0.
+The two coarsest levels, those of the third and the last tap, get the fewest channels a configuration can have, and weights
+that add nothing.
 Unless depth and confidence of six rendered clips stay the same to the bit, nothing is written.
 """
 import json
@@ -18,21 +19,22 @@ import model as small
 import scenes
 import train
 
-FEWEST = 4  # channels that lvggt reads
+FEWEST = 4       # channels that lvggt reads
+NOTHING = 1e-30  # beside a bias; zeros would look like a damaged file
 
 
 def dropped(tensors):
     """The weights with both levels silent."""
-    def zeros_like_part(name, rows, columns):
-        tensors[name] = torch.zeros(rows, columns, *tensors[name].shape[2:])
+    def silence(name, *shape):
+        tensors[name] = torch.full((*shape, *tensors[name].shape[2:]), NOTHING)
 
     for level in (2, 3):
         project, layer = f"depth_head.projects.{level}", f"depth_head.scratch.layer{level + 1}_rn.weight"
-        zeros_like_part(f"{project}.weight", FEWEST, tensors[f"{project}.weight"].shape[1])
-        tensors[f"{project}.bias"] = torch.zeros(FEWEST)
-        zeros_like_part(layer, tensors[layer].shape[0], FEWEST)
-    zeros_like_part("depth_head.resize_layers.3.weight", FEWEST, FEWEST)
-    tensors["depth_head.resize_layers.3.bias"] = torch.zeros(FEWEST)
+        silence(f"{project}.weight", FEWEST, tensors[f"{project}.weight"].shape[1])
+        silence(f"{project}.bias", FEWEST)
+        silence(layer, tensors[layer].shape[0], FEWEST)
+    silence("depth_head.resize_layers.3.weight", FEWEST, FEWEST)
+    silence("depth_head.resize_layers.3.bias", FEWEST)
     return tensors
 
 

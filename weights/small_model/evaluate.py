@@ -20,6 +20,7 @@ import torch
 import model as small
 import pictures
 import scenes
+import tuned
 
 HELD_OUT_SEED = 1_200_000_000
 
@@ -170,6 +171,7 @@ def main():
     arguments.add_argument("--threads", type=int, default=2)
     arguments.add_argument("--json")
     args = arguments.parse_args()
+    tuned.tune()
     torch.set_num_threads(args.threads)
     height, width = map(int, args.size.split("x"))
     model = load(args.model)

@@ -36,8 +36,9 @@ def export(checkpoint, out, config_path, note, side):
     if side:
         config["img_size"] = side
         tensors[POSITIONS] = resized_positions(tensors[POSITIONS], side // 14)
-    # Weights of layers; the rest is little, and float32 in the engine anyway.
-    tensors = {name: t.to(torch.bfloat16) if name.endswith(".weight") and t.ndim > 1 else t for name, t in tensors.items()}
+    # Weights of layers and the table of positions; the rest is little, and float32 in the engine anyway.
+    large = {name for name, t in tensors.items() if name.endswith(".weight") and t.ndim > 1} | {POSITIONS}
+    tensors = {name: t.to(torch.bfloat16) if name in large else t for name, t in tensors.items()}
     for name, t in tensors.items():
         if not torch.isfinite(t).all():
             raise SystemExit(f"export.py: {checkpoint}: {name} is not finite")

@@ -28,16 +28,15 @@ import evaluate
 import matching
 import model as small
 import scenes
+import tuned
 from helper import Helper
 from muon import Muon
 from shared_layers import SharedLayers
 
-TRAIN_SEED = 10_000_000      # batch k of stage s with --seed n: TRAIN_SEED * (10 (n - 1) + s + 1) + 64 k
-HELD_OUT_SEED = 900_000_000  # never trained on
+TRAIN_SEED = 10_000_000      # batch k of stage s with --seed n: TRAIN_SEED * (10 (n - 1) + s + 1) + 64 k, and from n = 10 on
+BEYOND = 2_000_000_000       # so much more, because training never uses those between
+HELD_OUT_SEED = 900_000_000
 MUON_RATE = 3                # its learning rate beside AdamW's
-# Memory stays with the process, in huge pages, and threads sleep while they wait: a step takes half the time.
-TUNED = {"OMP_WAIT_POLICY": "passive", "OPENBLAS_THREAD_TIMEOUT": "4", "MALLOC_MMAP_MAX_": "0",
-         "MALLOC_TRIM_THRESHOLD_": "20000000000", "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}
 
 
 class Stage:
@@ -75,6 +74,10 @@ class Recent:
         old = [change(clip) for change, seen in zip(self.CHANGES, reversed(queue)) for clip in seen]
         queue.append(fresh)
         return fresh + old[:clips - len(fresh)]
+
+
+def first_scene(seed):
+    return TRAIN_SEED * (10 * (seed - 1) + 1) + (BEYOND if seed > 9 else 0)
 
 
 def has_muon(name, parameter):
@@ -116,7 +119,7 @@ class Run:
         self.optimiser = torch.optim.AdamW([{"params": ps, "weight_decay": 0.02 * matrix, "part": part}
                                             for (matrix, part), ps in groups.items()], lr=0, betas=(0.9, 0.98), foreach=True)
         self.stage, self.step, self.total, self.spent, self.stop = 0, 0, 0, 0.0, False
-        self.bf16, self.depth_part, self.first_scene = args.bf16, args.depth_part, TRAIN_SEED * (10 * (args.seed - 1) + 1)
+        self.bf16, self.depth_part, self.first_scene = args.bf16, args.depth_part, first_scene(args.seed)
         self.decay = args.average
         self.save_every, self.score_every = 60 * args.save_minutes, args.score_every
         if args.resume:
@@ -255,7 +258,8 @@ def main():
     arguments.add_argument("run")
     arguments.add_argument("--stage", action="append", required=True)
     arguments.add_argument("--config", default=str(small.HERE / "config.json"))
-    arguments.add_argument("--seed", type=int, choices=range(1, 10), default=1, help="of the first weights and of the scenes, 1 to 9")
+    arguments.add_argument("--seed", type=int, default=1, metavar="N",
+                           help="of the first weights and of the scenes, 1 to 99")
     arguments.add_argument("--threads", type=int, default=2)
     arguments.add_argument("--bf16", action="store_true", help="products in bfloat16: faster on a CPU with AVX512_BF16")
     arguments.add_argument("--resume", action="store_true")
@@ -276,13 +280,14 @@ def main():
     args = arguments.parse_args()
     if not 0 <= args.depth_part <= 1:
         arguments.error(f"--depth-part: {args.depth_part} is not in 0 to 1")
+    if not 1 <= args.seed <= 99:
+        arguments.error(f"--seed: {args.seed} is not in 1 to 99")
     if args.new and not args.start_from:
         arguments.error("--new: without --start-from everything is new")
     for name in ("average", "momentum"):
         if not 0 <= getattr(args, name) < 1:
             arguments.error(f"--{name}: {getattr(args, name)} is not at least 0 and less than 1")
-    if any(name not in os.environ for name in TUNED):  # they are read when a process starts
-        os.execve(sys.executable, [sys.executable, "-u", *sys.argv], {**TUNED, **os.environ})
+    tuned.tune()
     torch.set_num_threads(args.threads)
     run = Run(args)
 

@@ -3,6 +3,7 @@
 
 #include <filesystem>
 #include <string>
+#include <vector>
 
 #include "lvggt/core/error.h"
 #include "lvggt/model/small_model.h"
@@ -20,15 +21,21 @@ inline constexpr const char* kSmallModelNotice =
     "(published checkpoints: weights/README.md)";
 
 // The path of a bundled file, from where this program lies: the same in the build tree and where
-// it is installed. The file is checked, see check_bundled_file().
-inline std::string find_bundled_file(const BundledFile& file) {
+// it is installed.
+inline std::string bundled_path(const BundledFile& file) {
   std::error_code error;
   const std::filesystem::path program = std::filesystem::read_symlink("/proc/self/exe", error);
   if (error)
     fail(ErrorKind::kRead, "cannot tell where this program lies, and so where ", file.name,
          " is: ", error.message(), "; name the weights with --weights");
-  const std::string path =
-      (program.parent_path() / LVGGT_BUNDLED_FROM_PROGRAM / file.name).lexically_normal().string();
+  return (program.parent_path() / LVGGT_BUNDLED_FROM_PROGRAM / file.name)
+      .lexically_normal()
+      .string();
+}
+
+// That path once the file is checked, see check_bundled_file().
+inline std::string find_bundled_file(const BundledFile& file) {
+  const std::string path = bundled_path(file);
   check_bundled_file(file, path);
   return path;
 }
@@ -39,6 +46,13 @@ void default_to_small_model(std::string& weights, const Say& say) {
   if (!weights.empty()) return;
   weights = find_bundled_file(kSmallModel);
   say(kSmallModelNotice);
+}
+
+// What loading `weights` warned of; nothing for the small model, whose content is known.
+template <class Model>
+std::vector<std::string> load_warnings(const Model& model, const std::string& weights) {
+  if (weights == bundled_path(kSmallModel)) return {};
+  return model.warnings();
 }
 
 }  // namespace lvggt::cli

@@ -19,7 +19,7 @@ struct BundledFile {
 
 // The trained small geometry model; its card is weights/small_model/README.md.
 inline constexpr BundledFile kSmallModel{
-    "lvggt_small.safetensors", "71a059423efaf45aa7cc65c85a76c4db71a21d1675ba8a1d46ba6da8bbd821b3"};
+    "lvggt_small.safetensors", "c3422236d901d809cd350f4e5d519fdc2e52bf12da5ec90bfd63e101973a2a81"};
 
 // Checks that `path` is that file. Throws kRead when there is none and kMismatch when its content
 // is another; both name the path and the expected sum.
