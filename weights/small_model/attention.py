@@ -1,3 +1,4 @@
+#!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """Attention of whole clips in training, from queries, keys and values on, by kernels/attention.cc: what ../pytorch
 computes, and a step takes little more than half the time.

@@ -1,13 +1,16 @@
+#!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """Teaches the global blocks where to look: what a patch of a later frame shows was somewhere in the first frame and in
 the frame before, and the renderer knows where. Two heads of each learning block but the last learn to attend there. Without it
-small models learn depth from single pictures and never compare frames; their cameras then have no direction."""
+small models learn depth from single pictures and never compare frames; their cameras then have no direction.
+  matching.py      compares kernels/matching.cc with PyTorch"""
 import ctypes
 
 import torch
 import torch.nn.functional as F
 
 import attention
+import scenes
 
 ALIKE = 0.06  # of log depth: the same surface
 
@@ -106,3 +109,25 @@ def loss(model, batch, special):
     way = Look.apply if seen[0][0].shape[-1] == attention.HEAD else look
     found = [way(*(x.contiguous() for x in pair), wanted, moved, special) for pair in seen]
     return sum(total for total, _ in found) / wanted.sum().clamp(min=1) / len(seen), found[-1][1] / moved.sum().clamp(min=1)
+
+
+def main():
+    torch.manual_seed(1)
+    generator, step, special = scenes.Generator(), 14, 5
+    for clips, frames in ((12, 2), (6, 4), (3, 7)):
+        batch = scenes.targets([generator.clip(1 + i, frames, 12 * step, 17 * step) for i in range(clips)])
+        wanted, moved = targets({name: torch.from_numpy(value) for name, value in batch.items()}, step)
+        shape, results = (clips, 2, frames * (special + wanted.shape[-1]), attention.HEAD), []
+        q, k = (2 * torch.randn(shape) for _ in range(2))
+        for way in (look, Look.apply):
+            parts = [x.clone().requires_grad_() for x in (q, k)]
+            total, right = way(*parts, wanted, moved, special)
+            results.append((total.detach(), right.float(), *torch.autograd.grad(total, parts)))
+        off = max(((a - b).abs().max() / a.abs().max().clamp(min=1e-9)).item() for a, b in zip(*results))
+        print(f"{clips} clips of {frames} frames, {int(results[0][1])} right: apart by {off:.1e} of the largest value at most")
+        if not off < 2e-5:
+            raise SystemExit("matching.py: matching.cc does not compute what PyTorch does")
+
+
+if __name__ == "__main__":
+    main()
