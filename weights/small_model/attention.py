@@ -23,10 +23,22 @@ class Call(ctypes.Structure):
     _fields_ = [(name, ctypes.c_void_p) for name in POINTERS] + [(name, ctypes.c_int64) for name in SIZES]
 
 
+def level():
+    """Of the x86-64 instruction sets, the largest that this processor has: a library is built for each and chosen when it runs."""
+    with open("/proc/cpuinfo") as file:
+        flags = next((set(line.split()) for line in file if line.startswith("flags")), set())
+    for name, needed in (("v4", {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}), ("v3", {"avx2", "fma", "bmi2"})):
+        if needed <= flags:
+            return name
+    return None
+
+
 @functools.lru_cache(maxsize=None)
 def library():
-    # Made where it runs and for the processor it runs on.
-    return ctypes.CDLL(str(scenes.build_library("kernels", scenes.HERE / "kernels", ["-march=native", "-fopenmp"])))
+    name = level()
+    flags = [f"-march=x86-64-{name}"] if name else []
+    built = scenes.build_library(f"kernels_{name or 'any'}", scenes.HERE / "kernels", [*flags, "-fopenmp", "-Wno-psabi"])
+    return ctypes.CDLL(str(built))
 
 
 def call(function, heads, frame, **tensors):
